@@ -122,13 +122,12 @@ def by_client(address: str, questions: int, bound: int) -> None:
     from cow_service.readers.mllm.client import MllmClient, PromptCall  # noqa: PLC0415
     from cow_service.readers.mllm.models import configure  # noqa: PLC0415
     from cow_service.settings import Settings  # noqa: PLC0415
-    from cow_service.vision.scene import Scene  # noqa: PLC0415
 
     settings = Settings(mllm="generic", mllm_base_url=f"{address}/v1", mllm_concurrency=bound, mllm_budget=3600)
     client = MllmClient(configure(settings), settings)
     inputs: dict[str, object] = {"question": QUESTION, "shown": "nothing", "facts": ()}
     calls = [PromptCall("eval-question", inputs, (), {}, str, vote) for vote in range(questions)]
-    given = ReaderInput(Scene(np.zeros((8, 8, 3), np.uint8)), QUESTION)
+    given = ReaderInput(np.zeros((8, 8, 3), np.uint8), QUESTION)
     failed = sum(not isinstance(reply, str) for reply in client.complete_all(calls, given))
     client.close()
     if failed:

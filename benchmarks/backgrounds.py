@@ -27,10 +27,10 @@ from stand_ins import GRID, read_truth
 
 from cow_service.errors import CowError
 from cow_service.generators.cutout.layers import take_apart
+from cow_service.media.types import Image, Mask
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.vision.types import Image, Mask
 
 BLUR, NOISE, TINT = 2.0, 3.0, 4.0  # px, grey levels, grey levels
 

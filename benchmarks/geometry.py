@@ -30,11 +30,11 @@ from stand_ins import TrueModels, TrueScene, read_truth, with_errors
 
 from cow_service.errors import CowError
 from cow_service.media.images import encode_png
+from cow_service.media.types import Floats32
 from cow_service.perception.base import Perception
 from cow_service.requests import AnswerRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.vision.types import Floats32
 
 ARMS: dict[str, dict[str, Any] | None] = {
     "picture alone": None,

@@ -29,11 +29,11 @@ from stand_ins import TrueCamera, TrueModels, TrueScene, TrueThing, motorcycle
 
 from cow_service.errors import CowError
 from cow_service.media.images import decode, decode_own, encode_png
+from cow_service.media.masks import bbox_of
 from cow_service.records import BBox, Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.vision.masks import bbox_of
 
 SURE = 0.8
 

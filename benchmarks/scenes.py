@@ -33,12 +33,12 @@ from cow_service.errors import CowError
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import generator as cutout
 from cow_service.generators.cutout.layers import Layers, take_apart
+from cow_service.media.masks import iou
+from cow_service.perception.observation import Observation, look
 from cow_service.records import BBox, Simulation
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.vision.masks import iou
-from cow_service.vision.scene import Scene
 
 DRAWN = 40  # grey levels between image and clean image where something was drawn
 SHADED = 8  # grey levels between the clean image and the true background where the mover's shadow is
@@ -126,7 +126,7 @@ def _row(service: Service, folder: Path, meta: dict[str, Any], simulation: Simul
     seen = None if layers is None or layers.moving[0].mask.shape != truth.shape else layers.moving[0].mask
     others = [tuple(boxes[0]) for name, boxes in meta["boxes"].items() if name != meta["object"]]
     centre, background, arrow = _frame_errors(
-        simulation, frames, Scene(np.ascontiguousarray(pixels)), clean, truth, others
+        simulation, frames, look(np.ascontiguousarray(pixels)), clean, truth, others
     )
     kinds = [
         encounter.kind
@@ -166,7 +166,7 @@ def pixels_of(encoded: bytes) -> NDArray[np.uint8]:
 def _frame_errors(
     simulation: Simulation,
     frames: list[NDArray[np.uint8]],
-    scene: Scene,
+    scene: Observation,
     clean: NDArray[np.uint8],
     truth: Mask,
     others: list[BBox],
@@ -210,7 +210,7 @@ def _meet(a: BBox, b: BBox) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def _locate(scene: Scene, mover: Mask, pixels: NDArray[np.uint8], shift: NDArray[np.float64]) -> float | None:
+def _locate(scene: Observation, mover: Mask, pixels: NDArray[np.uint8], shift: NDArray[np.float64]) -> float | None:
     """Distance (px) from where the mover should be to where it is best found in a frame; None next to the border.
 
     A mover that is not found at all counts as far off.

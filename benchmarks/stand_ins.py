@@ -22,11 +22,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from cow_service.media.masks import SAME_OBJECT_IOU, bbox_of, iou
+from cow_service.media.types import Floats, Floats32, Image, Mask
 from cow_service.perception.base import DepthReading, Detection, Perception, PerceptionKind, Prompt, Segment
 from cow_service.records import BBox
 from cow_service.settings import Settings
-from cow_service.vision.masks import SAME_OBJECT_IOU, bbox_of, iou
-from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 LEVELS = (0.0, 0.03, 0.05, 0.08)  # sizes of the smooth error of depth
 FOCAL_FACTORS = (0.9, 0.95, 1.0, 1.05, 1.1)

@@ -26,13 +26,13 @@ from cow_service.errors import CowError
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.generator import CutoutGenerator
 from cow_service.generators.wan.tracks import CLIP_FPS, MAX_FRAMES
+from cow_service.media.masks import iou, window_of
 from cow_service.narration.story import shown
 from cow_service.physics.tracks import Density, with_tracks
 from cow_service.records import Simulation, Trajectory
 from cow_service.requests import SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.vision.masks import CroppedMask, iou, window_of
 
 WAN_MOVE = Density(8, 50, 200)
 NEAR_TRUTH = 10.0  # px between the computed and the true path
@@ -57,7 +57,7 @@ def watch_the_compositor() -> list[GeneratorInput]:
 
 def dense(given: GeneratorInput) -> Trajectory:
     """With the tracks that Wan-Move would get."""
-    mover = CroppedMask.of(given.scene.silhouette(given.grounding.bbox))
+    mover = given.scene.mover
     masks = [mover, *(each.mask for each in given.obstacles)]
     return with_tracks(given.trajectory, masks, given.grounding.point, WAN_MOVE)
 

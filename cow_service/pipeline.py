@@ -24,10 +24,9 @@ def simulate(run: Run[SimulateRequest]) -> Simulation:
     """
     run.check_request()
     grounding = run.stage("grounding", ground)
-    if run.wants_depth:
-        run.take_depth(run.stage("depth", estimate_depth).depth)
-    motion = run.stage("motion", settle_motion, grounding, run.read_motion)
-    trajectory = run.stage("trajectory", compute_trajectory, grounding, motion)
+    depth = run.stage("depth", estimate_depth) if run.wants_depth else None
+    motion = run.stage("motion", settle_motion, grounding, run.read_motion, depth)
+    trajectory = run.stage("trajectory", compute_trajectory, grounding, motion, depth)
     clip = run.stage("generation", generate, grounding, motion, trajectory)
     return Simulation(
         id=run.simulation_id,

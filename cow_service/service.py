@@ -19,6 +19,7 @@ from cow_service.media.images import check, decode, decode_data_url
 from cow_service.net import ImageUrls
 from cow_service.observability.metrics import Metrics
 from cow_service.perception.base import Perception
+from cow_service.perception.observation import SeenImages
 from cow_service.pipeline import answer, simulate
 from cow_service.readers.base import Reader, WordReader
 from cow_service.readers.chat import CallsMllm, ChatReader
@@ -29,7 +30,6 @@ from cow_service.requests import AnswerRequest, SimulateRequest
 from cow_service.settings import Settings, SettingsError
 from cow_service.stages import run as runs
 from cow_service.stages.looking import look
-from cow_service.vision.scene import SeenImages
 from cow_service.weights.manifests import check_modules, find_manifest, load_manifests
 from cow_service.weights.repositories import ready
 

@@ -45,7 +45,8 @@ FOLDERS = {
     "errors": ("api", "client"),
     "media": ("media", "jobs"),
     "net": ("service",),
-    "physics": ("physics", "stages", "vision", "perception"),
+    "perception": ("perception", "readers"),
+    "physics": ("physics", "stages", "perception"),
     "pipeline": ("service", "jobs"),
     "records": ("narration", "stages", "client"),
     "registry": ("service", "readers"),
@@ -54,7 +55,6 @@ FOLDERS = {
     "service": ("service", "stages"),
     "settings": ("api", "service", "project"),
     "stages": ("stages", "readers", "service"),
-    "vision": ("vision", "readers"),
 }
 
 

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from floors import Box, Floats, TrueCamera, known, outline
 
+from cow_service.media.masks import CroppedMask
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import likeliest
 from cow_service.physics.engine import RigidShape, WorldRun
 from cow_service.physics.events import WorldEvents, find_world_events
 from cow_service.physics.world import WorldInput, Worlds, run_world
 from cow_service.records import MetresPerPixel, Motion
-from cow_service.vision.masks import CroppedMask
 
 RADIUS = 0.15  # m
 G = 9.81  # m/s^2

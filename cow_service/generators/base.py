@@ -10,11 +10,36 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from cow_service.media.types import Image, Mask
 from cow_service.records import GeneratorInfo, Grounding, Motion, Trajectory
 
 if TYPE_CHECKING:  # they need OpenCV, which a machine for video models may lack
+    from cow_service.media.masks import CroppedMask
     from cow_service.perception.base import Inpainter
-    from cow_service.vision.scene import Obstacle, Scene
+    from cow_service.perception.observation import Obstacle
+    from cow_service.physics.seen import Shadow
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The picture that a clip begins with."""
+
+    image: Image  # RGB [H, W, 3]
+    clean: Image  # [H, W, 3] without its cues: neither drawings nor earlier positions of a trail
+    cues: Mask  # [H, W] of what is drawn over the image
+    mover: CroppedMask  # of what moves
+    shadow: Shadow | None = None  # of a mover in the air, where that is all that tells of the light
+    backdrop: Image | None = None  # [H, W, 3] of a drawing seen from the side, without what is drawn on it
+
+    @property
+    def width(self) -> int:
+        """Pixels."""
+        return int(self.image.shape[1])
+
+    @property
+    def height(self) -> int:
+        """Pixels."""
+        return int(self.image.shape[0])
 
 
 @dataclass(frozen=True)

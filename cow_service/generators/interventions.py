@@ -10,17 +10,16 @@ from functools import partial
 import cv2
 import numpy as np
 
-from cow_service.generators.base import GeneratorInput
+from cow_service.generators.base import GeneratorInput, Scene
 from cow_service.generators.cutout.bodies import Extent, Ground, StillBody, moving_bodies, still_bodies
 from cow_service.generators.cutout.generator import compose
 from cow_service.generators.cutout.layers import MAX_SIDE, CutoutOptions, take_apart, without_bodies
 from cow_service.generators.cutout.shadows import take_shadows
 from cow_service.media.images import BAND, fit_within
+from cow_service.media.masks import CroppedMask, hull, resized_mask
+from cow_service.media.types import Image, Mask
 from cow_service.physics.camera import FloorCamera
 from cow_service.records import BBox, Path, Point, Trajectory
-from cow_service.vision.masks import CroppedMask, hull, resized_mask
-from cow_service.vision.scene import Scene
-from cow_service.vision.types import Image, Mask
 
 AWAY = 1e6  # px: where the path of what is taken away ends
 CHANGED = 3  # grey levels: what differs less is as it was
@@ -46,7 +45,7 @@ def without_removed(as_it_is: GeneratorInput, removed: Sequence[int], trajectory
     ground = Ground.of(leaving, size[0] / scene.width)
     moving = moving_bodies(leaving, size, ground)
     mover = as_it_is.grounding.bbox
-    whole = resized_mask(scene.silhouette(mover), size)
+    whole = resized_mask(scene.mover.full(), size)
     seen = whole & ~np.logical_or.reduce([body.mask for body in moving])
     extent = Extent(mover, False) if ground is None else ground.extent(0, mover)
     still = (*still_bodies(leaving, moving, size, ground), StillBody(0, seen, extent, whole))
@@ -66,7 +65,7 @@ def without_removed(as_it_is: GeneratorInput, removed: Sequence[int], trajectory
         for index, each in enumerate(as_it_is.obstacles[:kept], start=1)
     )
     if 0 in behind:
-        changed = changed.with_mask(mover, _completed(scene.cropped(mover), gone).full())
+        changed = replace(changed, mover=_completed(scene.mover, gone))
     return replace(as_it_is, scene=changed, trajectory=trajectory, obstacles=obstacles)
 
 
@@ -89,7 +88,8 @@ def _with_changes(scene: Scene, after: Image) -> Scene:
         for rows in (slice(top, top + BAND) for top in range(0, full.shape[0], BAND)):
             mixed = full[rows] + share[rows] * (enlarged[rows].astype(np.float32) - full[rows])
             after[rows] = np.where(share[rows] > 0, mixed, full[rows])
-    return scene.changed(np.where(scene.cues[..., None], scene.image, after) if scene.cues.any() else after, after)
+    image = np.where(scene.cues[..., None], scene.image, after) if scene.cues.any() else after
+    return replace(scene, image=image, clean=after)
 
 
 def with_put(given: GeneratorInput, factual: Trajectory) -> GeneratorInput:
@@ -110,12 +110,12 @@ def with_put(given: GeneratorInput, factual: Trajectory) -> GeneratorInput:
         if path.body not in put:
             continue
         bbox, degrees = given.trajectory.bodies[path.body].bbox, path.rotation[1] if path.rotation else 0.0
-        mask = given.obstacles[path.body - 1].mask if path.body else scene.cropped(grounding.bbox)
+        mask = given.obstacles[path.body - 1].mask if path.body else scene.mover
         mask = mask.moved(np.array(path.points[0]), np.array(path.points[1]), path.scale[1], degrees)
         if path.body:
             obstacles[path.body - 1] = replace(obstacles[path.body - 1], bbox=bbox, mask=mask)
         else:
-            changed = changed.with_mask(bbox, mask.full())
+            changed = replace(changed, mover=mask)
             grounding = grounding.model_copy(update={"bbox": bbox, "point": path.points[1]})
     return replace(given, scene=changed, obstacles=tuple(obstacles), grounding=grounding, before=before)
 

@@ -278,15 +278,16 @@ def compute(work: Work, service: Service, database: Database, hold_key: HoldKey)
     assert isinstance(request.image, ImageArtifact), "the image of a job is kept before the job is taken"
     given = work.progress, step, outages.wait_through, job.id, spec.created_at, spec.turn
     seen = None if spec.fresh else service.seen
-    with outages.wait_through(lambda: service.prepare(request, *given)).with_images(seen, job.owner) as run:
-        run.until = spec.until
-        try:
-            result = answer(cast("Run[AnswerRequest]", run)) if isinstance(request, AnswerRequest) else simulate(run)
-        except CowError:  # the stages before the one that failed are found by the next try
-            with suppress(CowError):
-                step.flush()
-            raise
-        step.flush()
+    run = outages.wait_through(lambda: service.prepare(request, *given))
+    run.share(seen, job.owner)
+    run.until = spec.until
+    try:
+        result = answer(cast("Run[AnswerRequest]", run)) if isinstance(request, AnswerRequest) else simulate(run)
+    except CowError:  # the stages before the one that failed are found by the next try
+        with suppress(CowError):
+            step.flush()
+        raise
+    step.flush()
     computed = {stage: seconds for stage, seconds in result.timings.items() if stage not in result.reused}
     simulation, verdict = result.simulation if isinstance(result, Answer) else result, verdict_of(result)
     trajectory_key = None if simulation is None else step.trajectory_key

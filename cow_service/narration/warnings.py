@@ -124,7 +124,7 @@ def warnings_of_outlines(trajectory: Trajectory) -> list[str]:
 def _of_depth(request: SimulateRequest, grounding: Grounding, trajectory: Trajectory) -> list[str]:
     """What a caller should know of how the depth map of a request was used, in sentences."""
     camera, depth = trajectory.camera, trajectory.depth
-    if request.depth is None or camera is None:
+    if camera is None or (depth is None and request.depth is None):
         return []
     if depth is None:
         return ["The depth map was not used: the path was given, or the law is `ballistic`."]

@@ -14,12 +14,11 @@ from typing import Any, Literal, Protocol, cast
 import cv2
 
 from cow_service.errors import PerceptionMissing, PerceptionUnavailable
+from cow_service.media.masks import CroppedMask
+from cow_service.media.types import Floats, Floats32, Image, Mask
 from cow_service.records import BBox, Point
 from cow_service.registry import Registry
 from cow_service.settings import Settings, SettingsError
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.scene import ImageKey
-from cow_service.vision.types import Floats, Floats32, Image, Mask
 from cow_service.weights.manifests import check_modules
 
 PerceptionKind = Literal["segmenter", "detector", "depth", "inpainter"]
@@ -34,7 +33,37 @@ SETS: dict[str, tuple[str, ...]] = {  # by the value of COW_PERCEPTION; all of t
     "cpu": ("sam2-tiny", "grounding-dino-tiny", "moge-2-small"),
     "gpu": ("sam2-large", "grounding-dino-base", "moge-2-large"),
 }
+ImageKey = tuple[str | None, str]
+"""The owner of the image, so that timing does not reveal the images of others; and its SHA-256."""
 MOST_EMBEDDINGS = 8  # images whose embedding is kept: some 16 MB each of a large model
+
+
+@dataclass(frozen=True)
+class Thing:
+    """One object of the image: its place and its colour. Not what kind of object it is, nor whether it moves."""
+
+    mask: CroppedMask
+    colour: str
+    colours: frozenset[str]  # all names that people may use for its colour
+    roundness: float  # 0..1, of the smallest circle around it: a disc has 1, a square 0.8, a bottle less than 0.5
+    confidence: float  # 0..1: how sure it is that this is one separable thing with this outline
+    is_disc: bool  # its outline was fitted by a circle: the mask is exact, segmenting it again would not improve it
+    is_hidden: bool = False  # by another thing in front of it, in part: its outline tells little
+    called: frozenset[str] = frozenset()  # the names under which a model found it
+
+    @property
+    def bbox(self) -> BBox:
+        """Tight box [x0, y0, x1, y1], px of the image."""
+        return self.mask.bbox
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Centre of the box, px."""
+        return (self.bbox[0] + self.bbox[2]) / 2, (self.bbox[1] + self.bbox[3]) / 2
+
+
+Find = Callable[[Image, Sequence[str]], tuple[Thing, ...]]
+"""Finds things in an image without drawings on it: those of some names, or whatever stands there if it knows none."""
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ import torch
 from transformers import DepthAnythingForDepthEstimation
 
 from cow_service.errors import PerceptionUnavailable
+from cow_service.media.types import Image
 from cow_service.perception.base import DepthReading
 from cow_service.perception.loading import LoadedModel, load, load_pretrained
 from cow_service.perception.moge import PATCH, load_moge, recover_camera
 from cow_service.settings import Settings
-from cow_service.vision.types import Image
 
 
 class MogeEstimator:

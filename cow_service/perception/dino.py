@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from transformers import AutoTokenizer, GroundingDinoForObjectDetection
 
+from cow_service.media.masks import iou
+from cow_service.media.types import Image
 from cow_service.perception.base import Detection
 from cow_service.perception.loading import LoadedModel, load, load_pretrained, translated
 from cow_service.records import BBox
 from cow_service.settings import Settings
-from cow_service.vision.masks import iou
-from cow_service.vision.types import Image
 
 SHORT_SIDE, LONG_SIDE = 800, 1333  # px: as the model was trained, the first as far as the second allows
 LEAST_SIDE = 32  # px: the coarsest of its feature maps has one cell for that

@@ -16,10 +16,10 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from cow_service.media.masks import scaled_size, window_of
+from cow_service.media.types import Image, Mask
 from cow_service.perception.loading import LoadedModel, check_keys, load
 from cow_service.settings import Settings
-from cow_service.vision.masks import scaled_size, window_of
-from cow_service.vision.types import Image, Mask
 from cow_service.weights.manifests import load_manifests
 
 CONTEXT, LEAST_CONTEXT = 1.0, 96  # of the hole's longer side, and px: so far around it the network sees

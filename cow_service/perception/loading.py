@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from cow_service.errors import CowError, PerceptionUnavailable, WeightsUnavailable, listed
+from cow_service.media.types import Image
 from cow_service.settings import Settings
-from cow_service.vision.types import Image
 from cow_service.weights.device import BUILD_LOCK, choose_device, is_out_of_memory, reason_of
 from cow_service.weights.manifests import Manifest, find_manifest
 from cow_service.weights.repositories import verify, weights_identity

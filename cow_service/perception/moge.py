@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from cow_service.media.types import Floats, Mask
 from cow_service.perception.loading import check_keys
-from cow_service.vision.types import Floats, Mask
 
 PATCH = 14  # px
 BACKBONES = {"dinov2_vits14": (384, 12, 6), "dinov2_vitb14": (768, 12, 12), "dinov2_vitl14": (1024, 24, 16)}

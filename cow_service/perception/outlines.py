@@ -1,16 +1,18 @@
 """Trustworthy outlines: those on which two prompts agree. A single one may be a fragment of an object."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from cow_service.perception.base import Embedded, Prompt, Segment
+from cow_service.media.masks import CroppedMask, bbox_of, iou, mask_iou
+from cow_service.media.types import Image, Mask
+from cow_service.perception.base import Detector, Embedded, Prompt, Segment, Thing
+from cow_service.perception.classical.regions import thing_of
+from cow_service.perception.classical.segmentation import mask_from_bbox
 from cow_service.records import BBox, Point
-from cow_service.vision.masks import CroppedMask, bbox_of, iou, mask_iou
-from cow_service.vision.types import Mask
 
 
 class OutlineRules(NamedTuple):
@@ -28,6 +30,8 @@ class OutlineRules(NamedTuple):
 
 
 OUTLINE = OutlineRules()
+MOST_FOUND = 24  # things that are outlined, best first
+SAME_THING = 0.7  # IoU from which two masks are one thing's
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,30 @@ def outlines_at(image: Embedded, point: Point) -> list[Outline]:
     close = [each for each in chosen if each.score >= chosen[0].score - OUTLINE.rival]
     outlines = [Outline(each.enlarged(*image.size), each.score, True) for each in close]
     return [each for each in outlines if each.mask.area]
+
+
+def find_named(detector: Detector, embedded: Embedded | None, image: Image, names: Sequence[str]) -> tuple[Thing, ...]:
+    """What a detector finds by some names in an image without drawings on it, outlined as well as can be.
+
+    One thing under two names is one thing. Without a segmenter outlines are cut by boxes.
+    """
+    found = detector.detect(image, names)[:MOST_FOUND] if names else ()
+    boxes = [each.bbox for each in found]
+    if embedded is None:
+        masks = [CroppedMask.of(mask) if (mask := mask_from_bbox(image, box)).any() else None for box in boxes]
+    else:
+        masks = [each.mask if each and each.is_sure else None for each in outlines_in(embedded, boxes)]
+    things = list[Thing]()
+    for each, mask in zip(found, masks, strict=True):
+        if mask is None:
+            continue
+        full = mask.full()
+        twin = next((at for at, one in enumerate(things) if mask_iou(one.mask.full(), full) > SAME_THING), None)
+        if twin is None:
+            things.append(replace(thing_of(image, mask), is_disc=False, called=frozenset((each.phrase,))))
+        else:
+            things[twin] = replace(things[twin], called=things[twin].called | {each.phrase})
+    return tuple(things)
 
 
 def _first(candidates: Sequence[Segment]) -> Segment | None:

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 from transformers import Sam2Model
 
+from cow_service.media.types import Image
 from cow_service.perception.base import Prompt, Segment
 from cow_service.perception.loading import LoadedModel, load, load_pretrained
 from cow_service.settings import Settings
-from cow_service.vision.types import Image
 
 MOST_TOGETHER = 32  # prompts in one pass of the decoder, which takes some 40 MB for each
 ON_IT, CORNERS = (1,), (2, 3)  # labels of the points of a prompt: one on the thing; first and last corner of a box

@@ -13,10 +13,10 @@ from functools import cached_property
 
 import numpy as np
 
+from cow_service.media.types import Floats, Mask
 from cow_service.physics.camera import FOCAL_WIDTHS
 from cow_service.records import Grounding, Motion, Vector
 from cow_service.requests import TrajectoryRequest
-from cow_service.vision.types import Floats, Mask
 
 GRAVITY = 9.81  # m/s^2
 DEFAULT_SPEED = 0.26  # image widths per second

@@ -9,9 +9,9 @@ from functools import cached_property
 
 import numpy as np
 
+from cow_service.media.masks import CroppedMask
+from cow_service.media.types import Floats
 from cow_service.records import FALLING_KINDS, BBox, Motion, ObjectPrior, Point, Shape, Source
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.types import Floats
 
 ON_TOP = 0.72  # of a support's height in the image, from its upper edge: a foot below that stands before it
 SHOWN = 0.1  # of a body's width: how much of its support's top is visible next to it, above its foot

@@ -4,8 +4,8 @@ from statistics import NormalDist
 
 import numpy as np
 
+from cow_service.media.types import Floats
 from cow_service.records import Doubt
-from cow_service.vision.types import Floats
 
 PARAMETERS: dict[str, Doubt] = {
     "pitch": "camera",

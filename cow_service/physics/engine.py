@@ -18,9 +18,9 @@ import rapier3d as rapier
 from numpy.typing import NDArray
 
 from cow_service.concurrency import on_one_core
+from cow_service.media.types import Floats, Mask
 from cow_service.physics.ballistic import GRAVITY, Course
 from cow_service.records import Shape
-from cow_service.vision.types import Floats, Mask
 
 ROUND_SIDES = 16  # wall segments of a round container: the opening is wider by at most 2% at their joints
 BOX_SIDES = 4

@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 
+from cow_service.media.types import Floats, Mask
 from cow_service.physics.draws import NAMES, PARAMETERS, ensemble, likeliest
 from cow_service.physics.events import NEVER, WorldEvents, find_world_events, seen_paths
 from cow_service.physics.placement import PlacementGoal
 from cow_service.physics.world import DrawnWorlds, WorldInput, Worlds, run_world
 from cow_service.records import Asked, AskedForm, AskedRelation, Doubt, EncounterKind
-from cow_service.vision.types import Floats, Mask
 
 BATCHES = (15, 30)  # worlds after which it is asked whether all that are wanted have to be run
 EVERY = 2  # frames of its clock between those that are recorded of the ensemble

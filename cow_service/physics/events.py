@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.media.masks import CroppedMask
+from cow_service.media.types import Floats, Mask
 from cow_service.physics.ballistic import NEAREST_FREE, has_passed
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import COLUMN
@@ -15,8 +17,6 @@ from cow_service.physics.engine import AT_START, TIPPED, RigidShape, WorldRun
 from cow_service.physics.layout import Layout
 from cow_service.physics.world import Worlds
 from cow_service.records import Encounter, EncounterKind
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.types import Floats, Mask
 
 NEVER = math.inf
 DISPLACED = 0.1  # of a body's half width: what is displaced less was not set in motion

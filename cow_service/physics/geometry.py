@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cow_service.media.masks import CroppedMask, eroded
+from cow_service.media.types import Floats, Floats32, Mask
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import HORIZON, CameraFit, axes_of
 from cow_service.records import BBox, DepthEstimate, Shape
-from cow_service.vision.masks import CroppedMask, eroded
-from cow_service.vision.types import Floats, Floats32, Mask
 
 
 class FloorSearch(NamedTuple):

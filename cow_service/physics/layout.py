@@ -12,6 +12,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from cow_service.media.types import Floats
 from cow_service.physics.bodies import HANGS, SeenBody, supports_of
 from cow_service.physics.camera import CameraFit
 from cow_service.physics.draws import COLUMN, quantiles
@@ -27,7 +28,6 @@ from cow_service.physics.lift import (
     velocity_towards,
 )
 from cow_service.records import Motion
-from cow_service.vision.types import Floats
 
 MEASURED_SIGMA = 0.03  # of a body's size by its depth: of the logarithm
 GOLDEN = math.pi * (3 - math.sqrt(5))  # radians between the mixtures of draws that two bodies take

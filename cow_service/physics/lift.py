@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.media.types import Floats
 from cow_service.physics.camera import FLAT, HORIZON, LONGEST, SHORTEST, CameraFit, axes_of
 from cow_service.physics.draws import COLUMN, quantiles
 from cow_service.records import BBox, Cue, Motion, Shape
-from cow_service.vision.types import Floats
 
 SIZE_SIGMA = 0.08  # of a body's width: boxes are inexact, and a thing is not as deep as wide
 FOOT_SIGMA = 0.02  # of a body's height in the image: where it meets the floor

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from cow_service.media.types import Floats
 from cow_service.physics import engine, events, lift
 from cow_service.physics.ballistic import GRAVITY, Course
 from cow_service.physics.bodies import SeenBody
@@ -20,7 +21,6 @@ from cow_service.physics.ensemble import EVERY, OF_EACH, SURE, SURE_OF_MISS, Que
 from cow_service.physics.layout import FARTHEST
 from cow_service.physics.lift import LiftedBody
 from cow_service.physics.world import CLOCK, DrawnWorlds, WorldInput
-from cow_service.vision.types import Floats
 
 DIGITS = 6  # significant digits: the engine uses no more
 CONSTANTS: dict[str, float] = {

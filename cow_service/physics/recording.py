@@ -10,6 +10,8 @@ import numpy as np
 
 from cow_service import records
 from cow_service.errors import CannotGround
+from cow_service.media.masks import turning
+from cow_service.media.types import Floats
 from cow_service.narration.warnings import cannot_stay
 from cow_service.physics import events
 from cow_service.physics.ballistic import FreePath, latest, sampled
@@ -22,8 +24,6 @@ from cow_service.physics.world import Worlds
 from cow_service.records import BBox, Path, Placement, Point, Trajectory
 from cow_service.records.world import BAND_PERCENTILES
 from cow_service.requests import TrajectoryRequest
-from cow_service.vision.masks import turning
-from cow_service.vision.types import Floats
 
 LEANS = 1.0  # degrees: with less, the box of what leans stays that of what stands upright
 MOST_LEAN = np.radians(25)

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.media.masks import CroppedMask, dilated, hull, scaled_size
+from cow_service.media.types import Floats, Mask
 from cow_service.physics.camera import FloorCamera
 from cow_service.physics.events import turned
 from cow_service.records import Body, Path, Point, Shape, StillTracks, Trajectory
-from cow_service.vision.masks import CroppedMask, dilated, hull, scaled_size
-from cow_service.vision.types import Floats, Mask
 
 POINT_DECIMALS = 3  # px
 SAMPLES = 96  # along a line of sight through a body

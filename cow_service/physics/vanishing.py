@@ -10,9 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cow_service.media.types import Floats
 from cow_service.records import BBox, Shape
-from cow_service.vision.edges import lengths_of
-from cow_service.vision.types import Floats
 
 DIRECTION_SIGMA = math.radians(0.7)  # of a segment, however long
 END_SIGMA = 0.0012  # of the image's longer side, of a segment's direction times its length
@@ -24,6 +23,11 @@ END_OF_RIM = 0.93  # of half a thing's width: beyond it a rim is too curved for 
 MOST_SEGMENTS = 10  # of one thing: the longest; what is costly grows with their square
 BY_CHANCE = 0.2  # of the things whose edges fit some camera: masts taper and things lean, so that they fit another one
 WEIGHT = 0.7  # of the evidence: an edge is often seen as several segments
+
+
+def lengths_of(segments: Floats) -> Floats:
+    """Lengths [N] (px) of segments [N, 4] (px)."""
+    return np.hypot(*(segments[:, 2:] - segments[:, :2]).T)
 
 
 @dataclass(frozen=True)

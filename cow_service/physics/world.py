@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from cow_service.media.masks import pieces_of
+from cow_service.media.types import Floats, Mask
 from cow_service.physics.ballistic import course_of
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.camera import CameraFit
@@ -27,8 +29,6 @@ from cow_service.physics.placement import (
     settle,
 )
 from cow_service.records import FALLING_KINDS, BBox, DepthEstimate, Motion, Shape
-from cow_service.vision.side_view import pieces_of
-from cow_service.vision.types import Floats, Mask
 
 FRICTION, FRICTION_SIGMA = 0.5, 0.5  # of a body; one standard deviation of the logarithm
 RESTITUTION, RESTITUTION_SIGMA = 0.5, 0.15

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 from cow_service import records
+from cow_service.media.types import Image
 from cow_service.narration.words import same_name
+from cow_service.perception.base import Thing
+from cow_service.perception.observation import Observation
 from cow_service.records import Grounding, Language, ObjectPrior, ObjectRequest, Reading, Source
-from cow_service.vision.scene import Scene
-from cow_service.vision.types import Image, Mask
 
 Likeness = Literal["same", "other", "unknown"]
 # What a caller can do if a reader finds no place or no direction; used at the end of its error messages.
@@ -27,15 +28,6 @@ class CallLog:
     notes: dict[str, None] = field(default_factory=dict[str, None])  # warnings of what was sent in another form
 
 
-@dataclass(frozen=True)
-class SeenThing:
-    """What the models of the server found for a noun."""
-
-    noun: str  # as it was asked for
-    mask: Mask  # [H, W]
-    score: float  # of the detector
-
-
 NOTHING_SAID = Reading()
 
 
@@ -43,8 +35,9 @@ NOTHING_SAID = Reading()
 class ReaderInput:
     """What every call of a reader is given. Readers keep nothing of it from one call to the next."""
 
-    scene: Scene
+    image: Image  # RGB [H, W, 3]
     question: str
+    observation: Observation | None = None  # what the image shows; None where only an answer is wanted
     given: Reading = NOTHING_SAID  # what is known: not to be read again. Objects without a place are to be located
     motion_wanted: bool = True  # stage 2 is left to the reader, as far as `given` does not say it
     language: Language = "en"  # of what is said of the simulation
@@ -55,7 +48,13 @@ class ReaderInput:
     calls: CallLog = field(default_factory=CallLog)
     check_canceled: Callable[[], None] = lambda: None  # to be called while waiting; raises `Canceled`
     cpu: Callable[[], AbstractContextManager[None]] = nullcontext  # to be held around work on the CPU; not reentrant
-    find: Callable[[Sequence[str]], tuple[SeenThing, ...]] | None = None  # by nouns, with `cpu` held; None: no detector
+    find: Callable[[Sequence[str]], tuple[Thing, ...]] | None = None  # by names, with `cpu` held; None: no detector
+
+    @property
+    def seen(self) -> Observation:
+        """What the image shows, for a reader that is asked to read it."""
+        assert self.observation is not None, "looked at before a reader is asked to read"
+        return self.observation
 
     @property
     def known(self) -> tuple[ObjectRequest, ...]:

@@ -9,17 +9,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cow_service.generators.base import GeneratorInput
+from cow_service.generators.base import GeneratorInput, Scene
 from cow_service.generators.interventions import with_put, without_removed
 from cow_service.media.artifacts import Put, disk_errors
 from cow_service.media.images import encode_jpeg, encode_png, fit_within
 from cow_service.media.overlay import DARK, LIGHT, Label, Replaced, draw_labels, draw_overlay
+from cow_service.media.types import Image
+from cow_service.perception.observation import Observation
 from cow_service.records import Clip, Frame, GeneratorInfo, Grounding, Motion, Trajectory, Video
 from cow_service.requests import FramesRequest, SimulateRequest
+from cow_service.stages.grounding import look_again
 from cow_service.stages.keys import StageResult
 from cow_service.stages.run import Run
 from cow_service.stages.seeing import obstacles_of
-from cow_service.vision.types import Image
 
 
 @dataclass(frozen=True)
@@ -146,8 +148,9 @@ def _inputs(
     run: Run[SimulateRequest], grounding: Grounding, motion: Motion, trajectory: Trajectory
 ) -> tuple[GeneratorInput, GeneratorInput | None]:
     """What the generator is given and, where something is changed first, what it is given for the scene as it is."""
-    scene = run.scene_of(grounding, motion.cue)
-    obstacles, taken = obstacles_of(scene, grounding)
+    observation = look_again(run, grounding, motion.cue)
+    obstacles, taken = obstacles_of(observation, grounding)
+    scene = scene_of(observation, grounding, trajectory)
     options, seed, inpainter = run.generator_options, run.request.clip_seed, run.backends.perception.inpainter
     if trajectory.factual is None:
         given = GeneratorInput(scene, grounding, motion, trajectory, obstacles, seed, options, inpainter=inpainter)
@@ -161,17 +164,30 @@ def _inputs(
     return with_put(given, trajectory.factual), as_it_is
 
 
+def scene_of(observation: Observation, grounding: Grounding, trajectory: Trajectory) -> Scene:
+    """The picture that a clip begins with."""
+    side_view, is_in_air = observation.side_view, bool(trajectory.bodies) and trajectory.bodies[0].support == "air"
+    return Scene(
+        image=observation.image,
+        clean=observation.clean,
+        cues=observation.cues,
+        mover=observation.mask_in(grounding.bbox),
+        shadow=observation.shadow_below(grounding.bbox) if is_in_air and trajectory.light is None else None,
+        backdrop=None if side_view is None else side_view.empty,
+    )
+
+
 def _draw_overlay(image: Image, given: GeneratorInput, as_it_is: GeneratorInput) -> bytes:
     """The overlay over the input image [H, W, 3], as JPEG."""
     grounding, trajectory = given.grounding, given.trajectory
-    mover = (as_it_is if given.before is None else given).scene.silhouette(grounding.bbox)
+    mover = (as_it_is if given.before is None else given).scene.mover.full()
     gone = as_it_is.obstacles[len(given.obstacles) :]
     placed: list[Replaced] = []
     for each in trajectory.placed:
         (old_bbox, old), (bbox, mask) = (
             (there.obstacles[each.body - 1].bbox, there.obstacles[each.body - 1].mask.full())
             if each.body
-            else (there.grounding.bbox, there.scene.silhouette(there.grounding.bbox))
+            else (there.grounding.bbox, there.scene.mover.full())
             for there in (as_it_is, given)
         )
         placed.append(Replaced(each.object, each.place, old_bbox, old, bbox, mask))

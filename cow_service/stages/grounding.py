@@ -11,8 +11,10 @@ from typing import NamedTuple
 from cow_service import errors, records
 from cow_service.errors import CannotGround, FieldError, InvalidRequest, field_of
 from cow_service.media.images import encode_png
+from cow_service.media.masks import is_among, is_same_object
 from cow_service.narration.story import OF_ITSELF, OF_TARGET
 from cow_service.narration.words import same_name
+from cow_service.perception.observation import Observation
 from cow_service.readers.base import GIVE_OBJECT, ReadResult, WordReader, WordsReading
 from cow_service.readers.options import plain
 from cow_service.records import Grounding, Intervention, LocatedObject, MotionRequest, ObjectRequest, Reading
@@ -21,8 +23,6 @@ from cow_service.stages.keys import StageResult
 from cow_service.stages.places import Located, bare, find_things, locate_given, outlined
 from cow_service.stages.run import Run
 from cow_service.stages.settling import SeenThings, box_of, mover_of, settle_mover, settle_places, settle_question
-from cow_service.vision.masks import is_among, is_same_object
-from cow_service.vision.scene import Scene
 
 FLOOR = frozenset({"floor", "the floor", "ground", "the ground"})
 
@@ -35,19 +35,20 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
     made, and what the reader raises.
     """
     with run.cpu():
-        given, own = locate_given(run)
+        observation = run.sight.look(run.words.trail_named)
+        given, own = locate_given(run, observation)
     if own is None:
-        reading, warnings = read_scene(run, given)
+        reading, warnings = read_scene(run, observation, given)
         with run.cpu():
-            mover, others, doubts = outlined(run, reading) if run.can_segment else bare(reading)
+            mover, others, doubts = (outlined if run.can_segment else bare)(run, observation, reading)
     else:
         reading, warnings = said_in_words(run), ()
         mover, others, doubts = own, (), ()
     apart = [each for each in given if not each.is_same_as(mover)]
     others = (*apart, *(each for each in others if not is_among(each.bbox, [known.bbox for known in apart])))
     with run.cpu():
-        scene, mask = cut_out(run, mover, others, reading)
         placed = [each.stored(run) for each in others]
+        observation, mask = cut_out(run, mover.stored(run), placed, reading)
     grounding = settle_grounding(run, reading, mover, placed, mask)
     notes = (
         *(warning for each in (mover, *given) for warning in each.warnings),
@@ -56,7 +57,7 @@ def ground(run: Run[SimulateRequest]) -> StageResult[Grounding]:
             for index, each in enumerate(given)
             if each not in apart and not same_name(each.name, mover.name)
         ),
-        *drawings_removed(scene, run.words),
+        *drawings_removed(observation, run.words),
         *unanswerable(grounding, run),
     )
     things = (*others_of(grounding), *removed_of(grounding))
@@ -75,21 +76,22 @@ def said_in_words(run: Run[SimulateRequest]) -> Reading:
     return said.model_copy(update={"grounding": None, "objects": (), "motion": None})
 
 
-def read_scene(run: Run[SimulateRequest], given: Sequence[Located]) -> tuple[Reading, tuple[str, ...]]:
+def read_scene(
+    run: Run[SimulateRequest], observation: Observation, given: Sequence[Located]
+) -> tuple[Reading, tuple[str, ...]]:
     """What the reader says of places and of what is asked, settled with the words and with what is seen; and warnings.
 
     A reader that may be wrong is asked once more with what speaks against its reading, and not to rely on the words
     where that is what they say; a reply that cannot be used then leaves the first. Raises what the reader raises.
     """
     known = [each.said for each in given if isinstance(each.said, ObjectRequest)]
-    find = partial(find_things, run) if "detector" in run.backends.perception.names else None
-    asking = run.reader_input("grounding", known=known)
-    asking = replace(asking, find=find, words=run.words)
-    settled = _settled(run, run.reader.read(asking), known)
+    find = partial(find_things, run, observation) if "detector" in run.backends.perception.names else None
+    asking = replace(run.reader_input("grounding", observation, known), find=find, words=run.words)
+    settled = _settled(run, observation, run.reader.read(asking), known)
     if settled.objections:
         again = replace(asking, objections=settled.objections, words=None if settled.is_misread else run.words)
         with suppress(CannotGround, errors.CannotReadDirection, errors.MllmBadReply, errors.MllmUnavailable):
-            settled = _settled(run, run.reader.read(again), known)
+            settled = _settled(run, observation, run.reader.read(again), known)
     return settled.reading, (*settled.warnings, *settled.objections)
 
 
@@ -102,11 +104,13 @@ class Settled(NamedTuple):
     is_misread: bool = False  # that is what the words say of what moves or is asked
 
 
-def _settled(run: Run[SimulateRequest], read: ReadResult, known: Sequence[ObjectRequest]) -> Settled:
+def _settled(
+    run: Run[SimulateRequest], observation: Observation, read: ReadResult, known: Sequence[ObjectRequest]
+) -> Settled:
     """The reading without what the request says, with its boxes, what is asked and what is changed settled."""
     words, said, request = run.backends.words(), run.words, run.request
     with run.cpu():
-        reading = located(run.scene, read.reading, run.reader.source)
+        reading = located(observation, read.reading, run.reader.source)
     if not run.reader.heeds_objections:
         return Settled(reading, read.warnings)
     if request.interventions:
@@ -118,8 +122,8 @@ def _settled(run: Run[SimulateRequest], read: ReadResult, known: Sequence[Object
     reading = reading.model_copy(update={"objects": tuple(others)})
     with run.cpu():
         boxes = [box_of(each) for each in (mover_of(reading), *others)]
-        is_bare = frozenset(bbox for bbox in boxes if not run.scene.shows_thing(bbox))
-        reading, objections, is_seen = settle_places(reading, SeenThings(run.scene.regions, is_bare))
+        is_bare = frozenset(bbox for bbox in boxes if not observation.shows_thing(bbox))
+        reading, objections, is_seen = settle_places(reading, SeenThings(observation.things, is_bare))
     unproved = () if is_seen else read.place_doubts
     if unproved:
         mover = mover_of(reading).model_copy(update={"is_doubtful": True})
@@ -129,10 +133,10 @@ def _settled(run: Run[SimulateRequest], read: ReadResult, known: Sequence[Object
     return Settled(reading, (*read.warnings, *unproved), (*objections, *misnamed, *misread), bool(misnamed or misread))
 
 
-def located(scene: Scene, reading: Reading, source: records.Source) -> Reading:
+def located(observation: Observation, reading: Reading, source: records.Source) -> Reading:
     """The reading with its source, and the box of what is at the point of a mover that was only pointed at."""
     mover = mover_of(reading)
-    boxed = {} if mover.bbox is not None or mover.point is None else {"bbox": scene.bbox_at(mover.point)}
+    boxed = {} if mover.bbox is not None or mover.point is None else {"bbox": observation.mask_at(mover.point).bbox}
     objects = tuple(each.model_copy(update={"source": source}) for each in reading.objects)
     own = mover.model_copy(update={"source": source, **boxed})
     return reading.model_copy(update={"grounding": own, "objects": objects})
@@ -142,13 +146,21 @@ def located(scene: Scene, reading: Reading, source: records.Source) -> Reading:
 
 
 def cut_out(
-    run: Run[SimulateRequest], mover: Located, others: Sequence[Located], reading: Reading
-) -> tuple[Scene, records.Artifact]:
-    """The scene in which it is known what moves, and the mask of that, stored. To be called with `cpu` held."""
+    run: Run[SimulateRequest], mover: LocatedObject, others: Sequence[LocatedObject], reading: Reading
+) -> tuple[Observation, records.Artifact]:
+    """What the image shows once it is known what moves, and the mask of that, stored. To be called with `cpu` held."""
     shows_trail = run.words.trail_named or (reading.motion is not None and reading.motion.cue == "trail")
-    scene = run.scene_with(mover.bbox, [each.bbox for each in others], shows_trail)
-    silhouette = scene.silhouette(mover.bbox) if mover.mask is None else mover.mask.full()
-    return scene, run.backends.artifacts.put(encode_png(silhouette), "image/png")
+    observation = run.observe(mover, others, shows_trail)
+    if mover.mask is not None:
+        return observation, mover.mask
+    mask = observation.mask_in(mover.bbox).full()
+    return observation, run.backends.artifacts.put(encode_png(mask), "image/png")
+
+
+def look_again(run: Run[SimulateRequest], grounding: Grounding, cue: records.Cue | None = None) -> Observation:
+    """What the image shows as a grounding, and the cue of its motion, have it. To be called with `cpu` held."""
+    changed = (thing for each in grounding.interventions for thing in (each.object, *each.targets))
+    return run.observe(grounding, (*grounding.others, *changed), grounding.trail_named or cue == "trail")
 
 
 def settle_grounding(
@@ -181,10 +193,10 @@ def settle_grounding(
     return put_into_first(understood(grounding, run.backends.words()), request, reading.motion)
 
 
-def drawings_removed(scene: Scene, words: WordsReading) -> list[str]:
+def drawings_removed(observation: Observation, words: WordsReading) -> list[str]:
     """A warning where the image has drawings over it of which the question does not speak."""
-    drawn = [("an arrow", each.tail) for each in scene.arrows if "arrow" not in words.drawings_named]
-    drawn += [("a box", each.bbox[:2]) for each in scene.boxes if "box" not in words.drawings_named]
+    drawn = [("an arrow", each.tail) for each in observation.arrows if "arrow" not in words.drawings_named]
+    drawn += [("a box", each.bbox[:2]) for each in observation.boxes if "box" not in words.drawings_named]
     places = ", ".join(f"{name} at ({x:.0f}, {y:.0f})" for name, (x, y) in drawn)
     told = (
         f"Taken for annotations drawn over the image, although the question mentions none: {places}. "

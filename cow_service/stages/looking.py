@@ -5,11 +5,11 @@ from collections.abc import Sequence
 
 from cow_service.errors import ArtifactNotFound, FieldError, InvalidRequest, PerceptionMissing, install_line
 from cow_service.media.images import decode, encode_png
+from cow_service.media.types import Image
 from cow_service.perception.base import ImageKey, Perception
-from cow_service.perception.outlines import Outline, outlines_at, outlines_in
+from cow_service.perception.outlines import MOST_FOUND, Outline, outlines_at, outlines_in
 from cow_service.records import BBox, Look, SeenObject
 from cow_service.requests import LookRequest
-from cow_service.vision.types import Image
 
 
 def look(
@@ -51,9 +51,6 @@ def look(
             box = each.bbox if outline is None else outline.bbox
             things.append(_seen(box, outline).model_copy(update={"name": each.phrase, "score": each.score}))
     return Look(image=key[1], width=width, height=height, things=tuple(things))
-
-
-MOST_FOUND = 24  # things that are outlined, best first
 
 
 def _seen(bbox: BBox, outline: Outline | None) -> SeenObject:

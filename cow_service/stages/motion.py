@@ -11,7 +11,9 @@ import numpy as np
 from cow_service import records
 from cow_service.errors import CannotReadDirection, FieldError, InvalidRequest, MllmBadReply, MllmUnavailable, field_of
 from cow_service.narration.words import bare_name, direction_words, place_words, same_name
-from cow_service.perception.facing import facing
+from cow_service.perception.classical.facing import facing
+from cow_service.perception.classical.trails import trail_of
+from cow_service.perception.observation import Observation, arrow_fault
 from cow_service.physics.ballistic import DEFAULT_SCENE_WIDTH, DEFAULT_SPEED, GRAVITY
 from cow_service.physics.camera import FloorCamera, depth_motion, fit_shadow, given_camera, way_to
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
@@ -20,13 +22,11 @@ from cow_service.readers.base import GIVE_DIRECTION, GIVE_OBJECT
 from cow_service.readers.prompts import load_prompt
 from cow_service.records import DIRECTED_KINDS, BBox, Grounding, LocatedObject, Motion, MotionRequest, Vector
 from cow_service.requests import SimulateRequest
-from cow_service.stages.grounding import others_of, placed_mover
-from cow_service.stages.keys import StageResult
+from cow_service.stages.depth import depth_map, focal_of
+from cow_service.stages.grounding import look_again, others_of, placed_mover
+from cow_service.stages.keys import EstimatedDepth, StageResult
 from cow_service.stages.run import Run
 from cow_service.stages.settling import Objections, SeenWay, settle_way
-from cow_service.vision.scene import Scene, arrow_fault
-from cow_service.vision.shadows import find_shadow
-from cow_service.vision.trails import trail_of
 
 THROW_SPEED, THROW_RADIUS = 1.8, 0.15  # m/s, m: of a toy that is thrown, where no speed is given
 THROW_DEPTH_DEVIATION = 20.0  # degrees: words and arrows tell a throw's heading in the image alone
@@ -39,7 +39,9 @@ LEAST_SIZE_SIGMA = 0.05
 MOST_APART = 2.0  # factor between two scales from which they disagree
 
 
-def settle_motion(run: Run[SimulateRequest], grounding: Grounding, read: MotionRequest | None) -> StageResult[Motion]:
+def settle_motion(
+    run: Run[SimulateRequest], grounding: Grounding, read: MotionRequest | None, depth: EstimatedDepth | None = None
+) -> StageResult[Motion]:
     """The motion: what the request says of it goes before what is measured, and that before what was read.
 
     `read` is what the reader said while it looked for the object; where the request leaves the motion open and nothing
@@ -62,7 +64,7 @@ def settle_motion(run: Run[SimulateRequest], grounding: Grounding, read: MotionR
         ends = f"a {said.stated_kind} ends where it hits something"
         is_one = "was" if len(unused) == 1 else "were"
         warnings.append(f"The {' and '.join(unused)} of the motion {is_one} not used: {ends}.")
-    scale, doubts = scale_of(run, grounding, said)
+    scale, doubts = scale_of(run, grounding, said, depth)
     warnings += doubts
     if is_up_the_floor(said, grounding, request.law):
         warnings.append(
@@ -74,8 +76,7 @@ def settle_motion(run: Run[SimulateRequest], grounding: Grounding, read: MotionR
     refuse_too_much(motion)
     if motion.cue == "trail":
         with run.cpu():
-            scene = run.scene_of(grounding, motion.cue)
-            motion = along_trail(scene, grounding, motion, run, said.speed is not None)
+            motion = along_trail(run, grounding, motion, depth, said.speed is not None)
     return StageResult(value=motion, warnings=(*warnings, *assumed(motion, said)))
 
 
@@ -123,7 +124,9 @@ def read_way(
     reader, warnings = run.reader, list[str]()
     place = records.GroundingRequest(object=grounding.object, bbox=grounding.bbox)
     known = tuple(map(records.as_said, grounding.others))
-    asking = run.reader_input("motion", run.scene_of(grounding, None if read is None else read.cue), known=known)
+    with run.cpu():
+        observation = look_again(run, grounding, None if read is None else read.cue)
+    asking = run.reader_input("motion", observation, known=known)
     asking = replace(asking, given=asking.given.model_copy(update={"grounding": place, "motion": read or given}))
     if read is None:
         result = reader.read(asking)
@@ -131,7 +134,7 @@ def read_way(
     words = run.words.reading.motion or MotionRequest()
 
     def settled(read: MotionRequest) -> tuple[MotionRequest, Objections]:
-        way, objections = settled_way(run, grounding, records.merged(given, read) or read, words, asking.scene)
+        way, objections = settled_way(run, grounding, records.merged(given, read) or read, words, observation)
         return records.merged(given, way) or way, objections  # what is given stays
 
     way, objections = settled(read)
@@ -152,7 +155,7 @@ def settled_way(
     grounding: Grounding,
     read: MotionRequest,
     said: MotionRequest,
-    scene: Scene | None = None,
+    observation: Observation | None = None,
 ) -> tuple[MotionRequest, Objections]:
     """The motion with its direction by the surest source. What is `said` in words, or given, decides.
 
@@ -162,31 +165,31 @@ def settled_way(
     if read.stated_kind not in (*DIRECTED_KINDS, "static", None) or is_exact:
         return read, ()
     with run.cpu():
-        scene = scene or run.scene_of(grounding, read.cue)
-        seen = seen_way(run, scene, grounding, read, said)
+        observation = observation or look_again(run, grounding, read.cue)
+        seen = seen_way(run, observation, grounding, read, said)
         way, objections = settle_way(read, said, seen, grounding.bbox)
         if way.direction is None and way.stated_kind in DIRECTED_KINDS:
-            raise CannotReadDirection(fault_of(scene, grounding, said, seen), remedy=GIVE_DIRECTION)
+            raise CannotReadDirection(fault_of(observation, grounding, said, seen), remedy=GIVE_DIRECTION)
     return way, objections
 
 
 def seen_way(
-    run: Run[SimulateRequest], scene: Scene, grounding: Grounding, read: MotionRequest, said: MotionRequest
+    run: Run[SimulateRequest], observation: Observation, grounding: Grounding, read: MotionRequest, said: MotionRequest
 ) -> SeenWay:
     """What the image shows of the way of the mover. To be called with `cpu` held."""
-    words, arrow, front = run.backends.words(), scene.arrow_at(grounding.bbox), None
+    words, arrow, front = run.backends.words(), observation.arrow_at(grounding.bbox), None
     if said.forward is not None and grounding.prior is not None and grounding.prior.elongated:
-        front = facing(scene.clean, scene.silhouette(grounding.bbox), grounding.bbox)
+        front = facing(observation.clean, observation.mask_in(grounding.bbox).full(), grounding.bbox)
     goal = said.towards or read.towards
     others = others_of(grounding) if goal else ()
     goals = [each for each in others if same_name(each.object, goal or "")]
     goals = goals or [each for each in others if words.likeness(goal or "", each.object) == "same"]
-    trail = trail_of(scene.trails, grounding.bbox)
+    trail = trail_of(observation.trails, grounding.bbox)
     if len(goals) != 1 or way_to(goals[0].bbox, grounding.bbox, is_on_floor=False) == (0.0, 0.0):
         goals = []
     return SeenWay(
         arrow=None if arrow is None else arrow.direction,
-        is_only_arrow=len(scene.arrows_near(grounding.bbox)) == 1,
+        is_only_arrow=len(observation.arrows_near(grounding.bbox)) == 1,
         goal=goals[0].bbox if goals else None,
         front=front,
         trail=None if trail is None else trail.heading,
@@ -194,11 +197,11 @@ def seen_way(
     )
 
 
-def fault_of(scene: Scene, grounding: Grounding, said: MotionRequest, seen: SeenWay) -> str:
+def fault_of(observation: Observation, grounding: Grounding, said: MotionRequest, seen: SeenWay) -> str:
     """Why nothing tells which way the mover goes."""
     name = grounding.object
     if said.along_arrow is not None:
-        return arrow_fault(scene, grounding)
+        return arrow_fault(observation, grounding)
     if said.cue == "trail":
         fault = f"no three positions of the {name} one after another were found in the image"
         return f"The question speaks of a trail, and {fault}."
@@ -209,7 +212,7 @@ def fault_of(scene: Scene, grounding: Grounding, said: MotionRequest, seen: Seen
         if grounding.prior is None or not grounding.prior.elongated:
             return f"{told} Which way they face is seen of vehicles with wheels alone."
         return f"{told} Which way it faces could not be seen for certain."
-    near = len(scene.arrows_near(grounding.bbox))
+    near = len(observation.arrows_near(grounding.bbox))
     return (
         "No direction was read in the question (left, right, up, down, towards, away, along the arrow), and the image "
         f"shows {near or 'no'} arrow{'s' * (near != 1)} at the {name}, and none was followed."
@@ -271,16 +274,17 @@ def scales_by_size(grounding: Grounding, camera: FloorCamera, mover_in_air: bool
 
 
 def scale_of(
-    run: Run[SimulateRequest], grounding: Grounding, said: MotionRequest
+    run: Run[SimulateRequest], grounding: Grounding, said: MotionRequest, estimated: EstimatedDepth | None
 ) -> tuple[records.MetresPerPixel, list[str]]:
     """Metres per pixel at the mover, and doubts: by a depth map in metres, else as given, else by sizes that are given,
     else as read of it or others, else of an image of the usual width.
     """
     request, given, width, height = run.request, said.metres_per_pixel, run.image.info.width, run.image.info.height
-    fit, depth_map, mapped = given_camera((width, height), said.down, request.camera, run.focal), run.depth, None
+    depth, mapped = depth_map(run, estimated), None
+    fit = given_camera((width, height), said.down, request.camera, focal_of(run, depth))
     camera = FloorCamera(width, height, math.exp(fit.mean[1]) * width, float(fit.mean[0]), fit.roll, 1.0)
-    if depth_map is not None and request.law == "contact" and request.trajectory is None:
-        mapped = depth_map.metres_per_pixel(grounding.bbox, camera.focal)
+    if depth is not None and request.law == "contact" and request.trajectory is None:
+        mapped = depth.metres_per_pixel(grounding.bbox, camera.focal)
     sizes = scales_by_size(grounding, camera, said.kind in records.FALLING_KINDS)
     told = {"metres_per_pixel": given, "the depth map, which is taken": mapped}
     told |= {f"the size of '{each.name}'": each.value for each in sizes}
@@ -516,10 +520,15 @@ def motion_sentence(motion: Motion, grounding: Grounding, towards: str | None = 
 
 
 def along_trail(
-    scene: Scene, grounding: Grounding, motion: Motion, run: Run[SimulateRequest], speed_given: bool
+    run: Run[SimulateRequest],
+    grounding: Grounding,
+    motion: Motion,
+    depth: EstimatedDepth | None,
+    speed_given: bool,
 ) -> Motion:
     """A motion read from a trail, with speed, direction and depth as the trail at the mover measures them."""
-    trail = trail_of(scene.trails, grounding.bbox)
+    observation = look_again(run, grounding, motion.cue)
+    trail = trail_of(observation.trails, grounding.bbox)
     if trail is None:
         return motion
     measured: dict[str, object] = {"trail": tuple(position.centre for position in trail.older)}
@@ -528,8 +537,8 @@ def along_trail(
         measured["direction_deviation"] = DIRECTION_DEVIATIONS["trail"]
     throw = None
     if motion.kind == "projectile":
-        shadow, size = find_shadow(scene, grounding.bbox), (scene.width, scene.height)
-        fit = given_camera(size, motion.down, run.request.camera, run.focal)
+        shadow, size = observation.shadow_below(grounding.bbox), (observation.width, observation.height)
+        fit = given_camera(size, motion.down, run.request.camera, focal_of(run, depth_map(run, depth)))
         fit = fit if shadow is None else fit_shadow(fit, grounding.bbox, shadow, size) or fit
         throw = fit_throw(trail.positions, fit, size)
     if throw is not None:

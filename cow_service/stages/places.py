@@ -9,19 +9,19 @@ import numpy as np
 
 from cow_service.errors import CannotGround, FieldError, InvalidRequest, field_of
 from cow_service.media.images import decode, encode_png
-from cow_service.perception.outlines import outlines_at, outlines_in
-from cow_service.readers.base import GIVE_PLACE, SeenThing
+from cow_service.media.masks import CroppedMask, iou, is_same_object, mask_iou
+from cow_service.perception.base import Embedded, Thing
+from cow_service.perception.observation import Observation
+from cow_service.perception.outlines import find_named, outlines_at, outlines_in
+from cow_service.readers.base import GIVE_PLACE
 from cow_service.records import BBox, GroundingRequest, LocatedObject, MaskRef, ObjectRequest, Reading, kept_mask
 from cow_service.requests import SimulateRequest
 from cow_service.stages.run import UNREADABLE, Run
 from cow_service.stages.settling import box_of, mover_of
-from cow_service.vision.masks import CroppedMask, iou, is_same_object, mask_iou
-from cow_service.vision.segmentation import mask_from_bbox
 
 DEFAULT_NAME = "object"
 SAME_BOX_IOU = 0.95  # of two objects of one request: one thing given twice
 SAME_MASK = 0.5  # IoU from which two outlines are of one thing
-MOST_FOUND = 24  # detections that are outlined, best first
 OWN_MASK = 0.5  # share of a mask that must lie in the box given with it
 WHITE = 128  # grey level from which a pixel of a mask is the object's
 LEAST_SIDE = 2  # px, of a mask
@@ -77,32 +77,34 @@ class Located:
         )
 
 
-def locate_given(run: Run[SimulateRequest]) -> tuple[list[Located], Located | None]:
+def locate_given(run: Run[SimulateRequest], observation: Observation) -> tuple[list[Located], Located | None]:
     """The objects of a request, and its mover; None where that is left to the reader.
 
     Raises as `_locate` does, and for an object that is given twice.
     """
     request, found = run.request, list[Located]()
     for index, each in enumerate(request.objects):
-        place = _locate(run, each, pointer := f"/objects/{index}")
+        place = _locate(run, observation, each, pointer := f"/objects/{index}")
         twin = next((at for at, other in enumerate(found) if iou(place.bbox, other.bbox) >= SAME_BOX_IOU), None)
         if twin is not None:
             detail = f"lies in the same box as `objects.{twin}`"
             message = f"`{field_of(pointer)}` {detail}: give each object once."
             raise InvalidRequest(message, errors=(FieldError(pointer, detail),))
         found.append(place)
-    return found, None if request.place is None else _locate(run, request.place, "/grounding")
+    return found, None if request.place is None else _locate(run, observation, request.place, "/grounding")
 
 
-def _locate(run: Run[SimulateRequest], given: GroundingRequest | ObjectRequest, pointer: str) -> Located:
+def _locate(
+    run: Run[SimulateRequest], observation: Observation, given: GroundingRequest | ObjectRequest, pointer: str
+) -> Located:
     """The place of an object; `pointer` is the JSON Pointer to `given`.
 
     Raises `InvalidRequest` for a place outside the image or all over it and for a mask that is none of this image, and
     `CannotGround` where what can be cut out around a point is no object.
     """
     run.check_canceled()
-    scene, field = run.scene, field_of(pointer)
-    outside = f"lies outside the upright image of {scene.width} x {scene.height} px"
+    field, width, height = field_of(pointer), observation.width, observation.height
+    outside = f"lies outside the upright image of {width} x {height} px"
     if given.mask is not None:
         mask = read_mask(run, given.mask, f"{pointer}/mask")
         bbox = mask.bbox if given.bbox is None else given.bbox
@@ -110,30 +112,28 @@ def _locate(run: Run[SimulateRequest], given: GroundingRequest | ObjectRequest, 
         inside = np.count_nonzero(mask.full()[y0:y1, x0:x1]) / mask.area
         if inside < OWN_MASK:
             raise _misplaced(f"{pointer}/bbox", bbox, f"holds {inside:.0%} of the `mask` beside it")
-        scene.preset_mask(bbox, mask.full)
         return Located.at(given, bbox, mask)
     if given.bbox is not None:
         x0, y0, x1, y1 = given.bbox
-        clipped = max(0.0, x0), max(0.0, y0), min(float(scene.width), x1), min(float(scene.height), y1)
+        clipped = max(0.0, x0), max(0.0, y0), min(float(width), x1), min(float(height), y1)
         wide, high = clipped[2] - clipped[0], clipped[3] - clipped[1]
         if wide < 2 or high < 2:
             raise _misplaced(f"{pointer}/bbox", given.bbox, outside)
-        if (share := wide * high / (scene.width * scene.height)) > MAX_SHARE:
+        if (share := wide * high / (width * height)) > MAX_SHARE:
             raise _misplaced(f"{pointer}/bbox", given.bbox, f"covers {share:.0%} of the image")
         beyond = f"`{field}.bbox` {list(given.bbox)} reaches beyond the image, so {list(clipped)} of it was taken."
         warnings = () if clipped == given.bbox else (beyond,)
         if run.can_segment:
-            return outlined_box(run, given, clipped, field, warnings)
+            return outlined_box(run, observation, given, clipped, field, warnings)
         return Located.at(given, clipped, warnings=warnings)
     x, y = given.point or (0.0, 0.0)
-    if not (0 <= x < scene.width and 0 <= y < scene.height):
+    if not (0 <= x < width and 0 <= y < height):
         raise _misplaced(f"{pointer}/point", (x, y), outside)
     # The first point of a path says less of the mover than a point that is given for it.
     may_guess = pointer == "/grounding" and run.request.grounding is None
     if run.can_segment:
-        found = outlines_at(run.embedded(), (x, y))
+        found = outlines_at(_embedded(run, observation), (x, y))
         if len(found) == 1 or (found and may_guess):
-            scene.preset_mask(found[0].bbox, found[0].mask.full)
             return Located.at(given, found[0].bbox, found[0].mask)
         fault = (
             f"{len(found)} objects lie there, one inside the other."
@@ -142,15 +142,15 @@ def _locate(run: Run[SimulateRequest], given: GroundingRequest | ObjectRequest, 
         )
         if not may_guess:
             raise _not_cut_out(f"The object at the point [{x:.0f}, {y:.0f}] is not clear: {fault}", pointer)
-    bbox = scene.bbox_at((x, y))
-    if scene.region_of(bbox) is not None:
+    mask = observation.mask_at((x, y))
+    bbox, fault = mask.bbox, observation.fault_of(mask)
+    if observation.thing_in(bbox) is not None:
         return Located.at(given, bbox)
-    fault = scene.fault_of(bbox)
     if fault is not None and not may_guess:
         raise _not_cut_out(f"No object could be cut out around the point [{x:.0f}, {y:.0f}]: {fault}.", pointer)
     box = ", ".join(f"{value:.0f}" for value in bbox)
     warning = f"The object around the point was guessed to be [{box}]; `{field}.bbox` says it for certain."
-    return Located.at(given, bbox, scene.cropped(bbox), (warning,))
+    return Located.at(given, bbox, mask, (warning,))
 
 
 def _not_cut_out(detail: str, pointer: str) -> CannotGround:
@@ -161,41 +161,52 @@ def _not_cut_out(detail: str, pointer: str) -> CannotGround:
     )
 
 
+def _embedded(run: Run[SimulateRequest], observation: Observation) -> Embedded:
+    """The image as the segmenter sees it, which the server must have: what is drawn over things is none of them."""
+    run.check_canceled()
+    owner, digest = run.sight.key
+    key = owner, digest + (" clean" if observation.cues.any() else "")
+    return run.backends.perception.embed(key, lambda: observation.undrawn)
+
+
 def outlined_box(
     run: Run[SimulateRequest],
+    observation: Observation,
     given: GroundingRequest | ObjectRequest,
     bbox: BBox,
     field: str,
     warnings: tuple[str, ...],
 ) -> Located:
     """What the segmenter sees in a box that the request gives; where it is not sure of it, nothing else is."""
-    (outline,) = outlines_in(run.embedded(), [bbox])
+    (outline,) = outlines_in(_embedded(run, observation), [bbox])
     if outline is None or not outline.is_sure:
         doubt = f"Two attempts to outline what is in `{field}.bbox` disagree: give its outline as `{field}.mask`."
         doubted = given.model_copy(update={"is_doubtful": True})
         return Located.at(doubted, bbox, None if outline is None else outline.mask, (*warnings, doubt))
-    run.scene.preset_mask(outline.bbox, outline.mask.full)
     return Located.at(given, outline.bbox, outline.mask, warnings)
 
 
-def find_things(run: Run[SimulateRequest], nouns: Sequence[str]) -> tuple[SeenThing, ...]:
-    """What the detector finds for some nouns, outlined as well as can be. To be called with `cpu` held."""
-    detector, scene = run.backends.perception.detector, run.scene
+def find_things(run: Run[SimulateRequest], observation: Observation, names: Sequence[str]) -> tuple[Thing, ...]:
+    """What the models of the server find by some names. To be called with `cpu` held."""
+    detector = run.backends.perception.detector
     assert detector is not None, "asked for only where there is a detector"
-    found = detector.detect(scene.undrawn, nouns)[:MOST_FOUND] if nouns else ()
-    if not run.can_segment:
-        masks = [(each, mask_from_bbox(scene.clean, each.bbox)) for each in found]
-        return tuple(SeenThing(each.phrase, mask, each.score) for each, mask in masks if mask.any())
-    outlines = zip(found, outlines_in(run.embedded(), [each.bbox for each in found]), strict=True)
-    return tuple(SeenThing(each.phrase, one.mask.full(), each.score) for each, one in outlines if one and one.is_sure)
+    embedded = _embedded(run, observation) if run.can_segment else None
+    return find_named(detector, embedded, observation.undrawn, names)
 
 
-def bare(reading: Reading) -> tuple[Located, tuple[Located, ...], tuple[str, ...]]:
-    """The things of a reading by their boxes alone."""
-    return Located(mover_of(reading)), tuple(map(Located, reading.objects)), ()
+def bare(
+    run: Run[SimulateRequest], observation: Observation, reading: Reading
+) -> tuple[Located, tuple[Located, ...], tuple[str, ...]]:
+    """The things of a reading by their boxes alone, but for a mover that was only pointed at."""
+    mover = mover_of(reading)
+    pointed = None if mover.point is None else observation.mask_at(mover.point)
+    is_cut = pointed is not None and pointed.bbox == mover.bbox and observation.thing_in(pointed.bbox) is None
+    return Located(mover, pointed if is_cut else None), tuple(map(Located, reading.objects)), ()
 
 
-def outlined(run: Run[SimulateRequest], reading: Reading) -> tuple[Located, tuple[Located, ...], tuple[str, ...]]:
+def outlined(
+    run: Run[SimulateRequest], observation: Observation, reading: Reading
+) -> tuple[Located, tuple[Located, ...], tuple[str, ...]]:
     """The things of a reading outlined by the segmenter, and doubts. To be called with `cpu` held.
 
     Raises `CannotGround` where no two looks agree on the outline of the mover: a scrap of it would be moved. Of others
@@ -203,7 +214,7 @@ def outlined(run: Run[SimulateRequest], reading: Reading) -> tuple[Located, tupl
     """
     mover = mover_of(reading)
     boxes = dict.fromkeys(box_of(each) for each in (mover, *reading.objects))
-    outlines = dict(zip(boxes, outlines_in(run.embedded(), list(boxes)), strict=True))
+    outlines = dict(zip(boxes, outlines_in(_embedded(run, observation), list(boxes)), strict=True))
     own, doubted = outlines[box_of(mover)], list[str]()
     if own is None or not own.is_sure:
         box = ", ".join(f"{value:.0f}" for value in box_of(mover))

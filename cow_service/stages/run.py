@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from contextvars import copy_context
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
-from typing import Any, Generic, Self, TypeVar
+from copy import copy
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Generic, TypeVar
 
-import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from cow_service import errors, records
@@ -20,16 +20,24 @@ from cow_service.concurrency import PrioritySemaphore
 from cow_service.errors import CowError, FieldError, InvalidRequest, pointer_part
 from cow_service.generators.base import Generator, Limits
 from cow_service.media.artifacts import ArtifactStore, RetryPolicy, try_once
-from cow_service.media.images import DecodedImage, decode_depth, decode_own_mask
+from cow_service.media.images import DecodedImage
 from cow_service.observability.logging import rfc3339
-from cow_service.perception.base import Embedded, Perception
-from cow_service.physics.geometry import DepthMap
+from cow_service.perception.base import Perception
+from cow_service.perception.observation import Observation, SeenImages, Sight
 from cow_service.readers.base import CallLog, Reader, ReaderInput, WordReader, WordsReading
-from cow_service.records import BBox, Grounding, Language, MotionRequest, ObjectRequest, Reading, Record, Stage, Usage
-from cow_service.requests import AnswerRequest, DepthRequest, SimulateRequest
+from cow_service.records import (
+    Grounding,
+    Language,
+    LocatedObject,
+    MotionRequest,
+    ObjectRequest,
+    Reading,
+    Record,
+    Stage,
+    Usage,
+)
+from cow_service.requests import AnswerRequest, SimulateRequest
 from cow_service.stages.keys import BackendRole, StageKey, StageResult, Value, key_of
-from cow_service.vision.scene import ImageKey, Scene, SeenImages
-from cow_service.vision.types import Mask
 
 # What reading a picture that a request attaches may end with.
 UNREADABLE = (errors.ArtifactNotFound, errors.ImageTooLarge, errors.ImageTypeUnsupported, errors.ImageUnreadable)
@@ -70,8 +78,6 @@ def check_request(generator: Limits, request: SimulateRequest) -> BaseModel:
     return options
 
 
-LEAST_NEAREST = 0.05  # of the usual depth: relative maps that begin nearer were shifted
-MAPPED_DEVIATION, EXIF_DEVIATION = 0.06, 0.08  # relative, of focal lengths: pictures with EXIF may be cropped
 ALMOST_DONE = 0.999  # of a stage whose end has not been reported
 
 Request_co = TypeVar("Request_co", bound=SimulateRequest, covariant=True)
@@ -105,18 +111,6 @@ def priority_of(turn: int, created_at: str) -> str:
     return f"{turn:010d} {created_at}"
 
 
-def _stored_mask(artifacts: ArtifactStore, mask: records.Artifact) -> Mask:
-    """A function apart from the run: a scene that knew its run would hold its pixels until garbage is collected."""
-    return decode_own_mask(artifacts.read(mask.sha256))
-
-
-def _no_depth(fault: str) -> InvalidRequest:
-    return InvalidRequest(
-        f"`depth.map` {fault}. Give a grey PNG with 16 bits, of the size of the upright image.",
-        errors=(FieldError("/depth/map", fault),),
-    )
-
-
 @dataclass(frozen=True)
 class Backends:
     """Who does the work of one request. Reader and generator are loaded when a stage first needs them."""
@@ -145,9 +139,7 @@ class Run(Generic[Request_co]):
     created_at: str = field(default_factory=now)
     turn: int = 0  # of the job, among those of all callers: the lower comes first
     until: float | None = None  # see `ReaderInput.until`
-    seen: SeenImages | None = None  # images that other runs have measured; None: everything is measured anew
-    _image_key: ImageKey = (None, "")
-    _is_estimated: bool = False  # the depth map, by a model
+    sight: Sight = field(init=False)  # its looks at the image, and what other runs have seen of it
     results: dict[Stage, StageResult[Any]] = field(default_factory=dict[Stage, StageResult[Any]])
     timings: dict[str, float] = field(default_factory=dict[str, float])  # seconds per stage
     reused: list[Stage] = field(default_factory=list[Stage])  # results that another request had computed
@@ -155,48 +147,26 @@ class Run(Generic[Request_co]):
     _current: tuple[Stage | None, float] = (None, 0.0)
     _beside: Future[Any] | None = None
 
-    @cached_property
-    def scene(self) -> Scene:
-        """The image before it is known what moves, and what is measured in it when first asked for."""
-        scene = Scene(self.image.pixels, trail_named=self.words.trail_named)
-        if self.seen is not None:
-            self.seen.recall(self._image_key, scene)
-        return scene
+    def __post_init__(self) -> None:
+        self.share(None)
 
-    def scene_with(self, mover: BBox, others: Sequence[BBox], trail_named: bool) -> Scene:
-        """The image in which a trail ends at what moves: its earlier positions are taken out.
+    def share(self, seen: SeenImages | None, owner: str | None = None) -> None:
+        """Finds what other runs of its owner have seen in its image, and has them find what it sees. None: nothing."""
+        self.sight = Sight(self.image.pixels, (owner, self.image.info.sha256), seen)
 
-        Where a trail is named, balls that look alike, one after another, are one. Neither the mover nor the others are
-        annotations.
+    def observe(self, mover: LocatedObject | Grounding, others: Sequence[LocatedObject], trails: bool) -> Observation:
+        """What the image shows once it is known what moves and what else matters. To be called with `cpu` held.
+
+        Masks are those that were stored: one that is cut again from its box may differ from what was given.
         """
-        scene = self.scene.keeping((mover, *others))
-        return (scene.with_trail_named() if trail_named else scene).with_mover(mover)
-
-    def scene_of(self, grounding: Grounding, cue: records.Cue | None = None) -> Scene:
-        """The image as a grounding, and the cue of its motion, have it; its masks are those that were stored.
-
-        A mask cut again from its box may differ from one that was cut around a point, or given.
-        """
-        changed = (thing for each in grounding.interventions for thing in (each.object, *each.targets))
-        others = (*grounding.others, *changed)
-        boxes = [each.bbox for each in others]
-        scene = self.scene_with(grounding.bbox, boxes, grounding.trail_named or cue == "trail")
-        for placed in (grounding, *others):
-            if placed.mask is not None:
-                scene.preset_mask(placed.bbox, partial(_stored_mask, self.backends.artifacts, placed.mask))
-        return scene
+        read = self.backends.artifacts.read
+        things = [(each.bbox, each.mask.sha256) for each in (mover, *others) if each.mask is not None]
+        return self.sight.look_closer(mover.bbox, [each.bbox for each in others], trails, tuple(things), read)
 
     @property
     def can_segment(self) -> bool:
         """Whether the server has a segmenter."""
         return "segmenter" in self.backends.perception.names
-
-    def embedded(self) -> Embedded:
-        """The image as the segmenter sees it; the server must have one. To be called with `cpu` held."""
-        self.check_canceled()
-        clean = " clean" if self.scene.cues.any() else ""  # what is drawn over things is none of them
-        key = self._image_key[0], self.image.info.sha256 + clean
-        return self.backends.perception.embed(key, lambda: self.scene.undrawn)
 
     @property
     def wants_depth(self) -> bool:
@@ -205,45 +175,6 @@ class Run(Generic[Request_co]):
         is_free = request.depth is None and request.trajectory is None and request.law == "contact"
         return is_free and "depth" in self.backends.perception.names
 
-    def take_depth(self, depth: DepthRequest | None) -> None:
-        """Goes on as if the request had given that depth map, but says whose it is."""
-        self.request, self._is_estimated = self.request.model_copy(update={"depth": depth}), depth is not None
-        self.__dict__.pop("depth", None)
-
-    @cached_property
-    def depth(self) -> DepthMap | None:
-        """The depth map of the request. Raises `InvalidRequest` for one that is none of this image."""
-        given, image = self.request.depth, self.image.info
-        if given is None:
-            return None
-        assert isinstance(given.map, records.ImageArtifact), "the pictures of a request are kept before its stages run"
-        try:
-            data = self.backends.artifacts.read(given.map.artifact)
-            values = decode_depth(data, max_megapixels=image.width * image.height / 1e6)
-        except errors.ImageTooLarge as error:
-            raise _no_depth(f"is larger than the upright image of {image.width} x {image.height} px") from error
-        except UNREADABLE as error:
-            raise _no_depth(f"cannot be read: {error.detail.rstrip('.')}") from error
-        if values.shape != (image.height, image.width):
-            size = f"{values.shape[1]} x {values.shape[0]} px"
-            raise _no_depth(f"has {size} where the upright image has {image.width} x {image.height} px")
-        if not values.any():
-            raise _no_depth("is empty: every pixel is 0, which says that nothing is known")
-        nearest, usual = (float(value) for value in np.percentile(values[values > 0], (1, 50)))
-        if given.scale is None and nearest < LEAST_NEAREST * usual:
-            raise _no_depth("begins at the camera itself: depths must be proportional to distances, without an offset")
-        depth = np.where(values > 0, values, np.float32(np.nan))  # 16 bits: exact
-        source = "model" if self._is_estimated else "request"
-        return DepthMap(depth, given.scale, given.deviation, given.focal, source)
-
-    @property
-    def focal(self) -> records.Estimate | None:
-        """The focal length (px) that the depth map was made with, else the one of the image's EXIF."""
-        mapped, exif = None if self.depth is None else self.depth.focal, self.image.info.focal
-        if mapped is not None:
-            return records.Estimate(value=mapped, deviation=MAPPED_DEVIATION * mapped)
-        return None if exif is None else records.Estimate(value=exif, deviation=EXIF_DEVIATION * exif)
-
     @cached_property
     def words(self) -> WordsReading:
         """What the question says in words."""
@@ -251,16 +182,6 @@ class Run(Generic[Request_co]):
         place = self.request.place
         given += [] if place is None or place.object is None else [place.object]
         return self.backends.words().read_question(self.request.question, given)
-
-    @contextmanager
-    def with_images(self, seen: SeenImages | None, owner: str | None = None) -> abc.Generator[Self]:
-        """The run, which finds what others of its owner have measured in its image, and has them find what it has."""
-        self.seen, self._image_key = seen, (owner, self.image.info.sha256)
-        try:
-            yield self
-        finally:
-            if seen is not None and "scene" in self.__dict__:
-                seen.keep(self._image_key, self.scene)
 
     @property
     def reader(self) -> Reader:
@@ -336,7 +257,8 @@ class Run(Generic[Request_co]):
                 raise errors.Canceled("The run has ended without this stage.")
             self.progress(None, 0.0)
 
-        side = replace(self, progress=check)  # with the same results, times and calls
+        side = copy(self)  # with the same results, times, calls and looks
+        side.progress = check
         try:
             with ThreadPoolExecutor(1, thread_name_prefix=name) as thread, ExitStack() as leaving:
                 leaving.callback(left.set)
@@ -377,7 +299,7 @@ class Run(Generic[Request_co]):
         return self.backends.device().held(self.priority, self.check_canceled)
 
     def reader_input(
-        self, stage: Stage, scene: Scene | None = None, known: Sequence[ObjectRequest] = ()
+        self, stage: Stage, observation: Observation | None = None, known: Sequence[ObjectRequest] = ()
     ) -> ReaderInput:
         """What the reader is given on behalf of a stage: the image, and what the caller says, with what is `known`."""
         self._calls[stage] = CallLog()
@@ -390,7 +312,8 @@ class Run(Generic[Request_co]):
             asked=request.asked,
         )
         return ReaderInput(
-            scene=scene or self.scene,
+            image=self.image.pixels,
+            observation=observation,
             question=request.question,
             given=given,
             motion_wanted="motion" in request.left_to_reader,

@@ -7,20 +7,22 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from cow_service.media.masks import is_among
+from cow_service.media.types import Floats
 from cow_service.narration.words import same_name
+from cow_service.perception.classical.edges import divide
+from cow_service.perception.classical.forms import shape_seen
+from cow_service.perception.classical.openings import measure_opening
+from cow_service.perception.observation import CLEAR_CUT, Observation, Obstacle
 from cow_service.physics.bodies import SeenBody, no_edges
 from cow_service.physics.geometry import DepthMap
+from cow_service.physics.seen import SeenOpening, Shadow
 from cow_service.records import Asked, BBox, Estimate, Grounding, Intervention, LocatedObject, Motion, ObjectPrior
 from cow_service.requests import SimulateRequest
+from cow_service.stages.depth import depth_map, focal_of
 from cow_service.stages.grounding import others_of, placed_mover, removed_of
+from cow_service.stages.keys import EstimatedDepth
 from cow_service.stages.run import Run
-from cow_service.vision.edges import divide
-from cow_service.vision.forms import shape_seen
-from cow_service.vision.masks import is_among
-from cow_service.vision.openings import SeenOpening, measure_opening
-from cow_service.vision.scene import CLEAR_CUT, Obstacle, Scene
-from cow_service.vision.shadows import Shadow, find_shadow
-from cow_service.vision.types import Floats
 
 PART = 0.5  # of a region's area: with more of it inside a thing that is removed, it is a part of that
 
@@ -82,46 +84,52 @@ def located_of(grounding: Grounding) -> tuple[LocatedObject, ...]:
     return (*others_of(grounding), *removed_of(grounding))
 
 
-def see(run: Run[SimulateRequest], scene: Scene, grounding: Grounding, motion: Motion) -> Situation:
-    """The situation that a scene shows. Raises `InvalidRequest` for a depth map that is none of the image."""
+def see(
+    run: Run[SimulateRequest],
+    observation: Observation,
+    grounding: Grounding,
+    motion: Motion,
+    estimated: EstimatedDepth | None = None,
+) -> Situation:
+    """The situation that an image shows. Raises `InvalidRequest` for a depth map that is none of the image."""
     request = run.request
     on_path = request.trajectory is not None or (motion.law == "ballistic" and motion.kind != "place")
-    side_view = None if on_path else scene.side_view
-    obstacles, removed = obstacles_of(scene, grounding)
-    bodies = see_bodies(scene, grounding, motion, (*obstacles, *removed), side_view is not None)
+    side_view = None if on_path else observation.side_view
+    depth, (obstacles, removed) = depth_map(run, estimated), obstacles_of(observation, grounding)
+    bodies = see_bodies(observation, grounding, motion, (*obstacles, *removed), side_view is not None)
     situation = Situation(
         grounding=grounding,
         motion=motion,
         request=request,
-        size=(scene.width, scene.height),
+        size=(observation.width, observation.height),
         bodies=bodies,
         count=1 + len(obstacles),
         follows_path=on_path,
-        is_separated=bool(scene.regions or obstacles or removed),
+        is_separated=bool(observation.things or obstacles or removed),
         level=None if side_view is None else side_view.level,
-        faint=see_unlisted(scene, grounding, request),
+        faint=see_unlisted(observation, grounding, request),
         openings=see_openings(grounding, bodies),
-        depth=None if on_path else run.depth,
-        focal=run.focal,
+        depth=None if on_path else depth,
+        focal=focal_of(run, depth),
     )
-    return situation if situation.depth is not None or side_view is not None else with_edges(scene, situation)
+    return situation if situation.depth is not None or side_view is not None else with_edges(observation, situation)
 
 
-def with_edges(scene: Scene, situation: Situation) -> Situation:
+def with_edges(observation: Observation, situation: Situation) -> Situation:
     """With what else than a depth map tells of the camera: straight edges, and the shadow of a ball in the air."""
     mover = situation.bodies[0]
-    edges, lines = divide(scene.segments, [body.mask for body in situation.bodies])
+    edges, lines = divide(observation.segments, [body.mask for body in situation.bodies])
     bodies = tuple(replace(body, edges=own) for body, own in zip(situation.bodies, edges, strict=True))
     is_ball_in_air = mover.shape == "sphere" and mover.flies(situation.motion)
-    shadow = find_shadow(scene, mover.bbox) if is_ball_in_air else None
+    shadow = observation.shadow_below(mover.bbox) if is_ball_in_air else None
     return replace(situation, bodies=bodies, lines=lines, shadow=shadow)
 
 
-def obstacles_of(scene: Scene, grounding: Grounding) -> tuple[tuple[Obstacle, ...], tuple[Obstacle, ...]]:
+def obstacles_of(observation: Observation, grounding: Grounding) -> tuple[tuple[Obstacle, ...], tuple[Obstacle, ...]]:
     """What stands beside the mover, and what of it is removed before the motion; no more than is listed where a list
     says that it is complete."""
     removed, others = removed_of(grounding), others_of(grounding)
-    found = scene.obstacles(grounding.bbox, (*others, *removed))
+    found = observation.obstacles(grounding.bbox, (*others, *removed))
     gone, named = {each.bbox for each in removed}, {other.bbox for other in others}
     if grounding.objects_complete:
         found = tuple(each for each in found if each.bbox in gone | named)
@@ -134,7 +142,7 @@ def obstacles_of(scene: Scene, grounding: Grounding) -> tuple[tuple[Obstacle, ..
 
 
 def see_bodies(
-    scene: Scene, grounding: Grounding, motion: Motion, others: Sequence[Obstacle], is_side_view: bool
+    observation: Observation, grounding: Grounding, motion: Motion, others: Sequence[Obstacle], is_side_view: bool
 ) -> tuple[SeenBody, ...]:
     """The mover, then some others."""
     mover = LocatedObject(
@@ -148,7 +156,7 @@ def see_bodies(
     rider, carrier = _carrier_of(grounding, motion)
 
     def body_of(seen: Obstacle, thing: LocatedObject) -> SeenBody:
-        prior, region = thing.prior or ObjectPrior(), scene.region_of(seen.bbox)
+        prior, region = thing.prior or ObjectPrior(), observation.thing_in(seen.bbox)
         if carrier and same_name(seen.name, rider) and prior.stands_on is None:
             prior = prior.model_copy(update={"stands_on": carrier})
         shape = prior.shape
@@ -162,13 +170,13 @@ def see_bodies(
             shape=shape or "cylinder",  # it stands upright
             is_form_known=shape is not None,
             source=thing.source or "embedded",
-            confidence=scene.confidence_of(seen.bbox),
+            confidence=observation.confidence_in(seen.bbox),
             prior=prior,
             bbox_deviation=thing.bbox_deviation,
             stands_out=region is not None or is_side_view,
         )
 
-    first = body_of(Obstacle(mover.object, mover.bbox, scene.cropped(mover.bbox)), mover)
+    first = body_of(Obstacle(mover.object, mover.bbox, observation.mask_in(mover.bbox)), mover)
     own = first.prior  # of what moves it is known which way is along
     first = replace(first, elongated=own.elongated, equal_sided=own.equal_sided, point=grounding.point)
     unnamed = (located.get(each.bbox, LocatedObject(object=each.name, bbox=each.bbox)) for each in others)
@@ -195,14 +203,14 @@ def see_openings(grounding: Grounding, bodies: Sequence[SeenBody]) -> dict[BBox,
     return {body.bbox: measure_opening(body.mask, square=body.prior.opening == "square") for body in containers}
 
 
-def see_unlisted(scene: Scene, grounding: Grounding, request: SimulateRequest) -> tuple[BBox, ...]:
+def see_unlisted(observation: Observation, grounding: Grounding, request: SimulateRequest) -> tuple[BBox, ...]:
     """Boxes of what is clearly seen as one thing, and is no part of an estimated list that says that it is complete."""
     is_given = request.objects_complete and all(each.source == "request" for each in request.objects)
     if is_given or not grounding.objects_complete:
         return ()
     listed = located_of(grounding)
-    known = np.zeros((scene.height, scene.width), bool)
+    known = np.zeros((observation.height, observation.width), bool)
     for x0, y0, x1, y1 in (grounding.bbox, *(each.bbox for each in listed)):
         known[int(y0) : int(y1) + 1, int(x0) : int(x1) + 1] = True
-    clear = (each for each in scene.obstacles(grounding.bbox, listed) if each.confidence >= CLEAR_CUT)
+    clear = (each for each in observation.obstacles(grounding.bbox, listed) if each.confidence >= CLEAR_CUT)
     return tuple(each.bbox for each in clear if each.mask.shared_with(known) < PART * each.mask.area)

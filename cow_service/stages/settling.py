@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from cow_service import records
+from cow_service.media.masks import iou, is_same_object
+from cow_service.perception.base import Thing
 from cow_service.physics.camera import way_to
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
 from cow_service.readers.base import WordReader, WordsReading
 from cow_service.records import DIRECTED_KINDS, BBox, GroundingRequest, MotionRequest, ObjectRequest, Reading, Vector
-from cow_service.vision.masks import iou, is_same_object
-from cow_service.vision.regions import Region
 
 Objections = tuple[str, ...]
 """What speaks against a reading, in whole sentences."""
@@ -184,7 +184,7 @@ EDGE_OFF = 0.25  # of the sides of a thing that is seen: an estimated edge this 
 class SeenThings:
     """What the image shows of things."""
 
-    regions: Sequence[Region] = ()
+    things: Sequence[Thing] = ()
     bare: frozenset[BBox] = frozenset()  # those of the boxes that were read in which nothing stands
 
 
@@ -195,7 +195,7 @@ def settle_places(read: Reading, seen: SeenThings) -> tuple[Reading, Objections,
     last value says whether the mover's box was moved onto a thing.
     """
     mover = mover_of(read)
-    moved = onto_regions(list(dict.fromkeys(box_of(each) for each in (mover, *read.objects))), seen.regions)
+    moved = onto_things(list(dict.fromkeys(box_of(each) for each in (mover, *read.objects))), seen.things)
     objections, doubtful = list[str](), set[BBox]()
     for thing in dict.fromkeys((mover, *read.objects)):
         fault = fault_of(thing, moved[box_of(thing)], seen)
@@ -203,7 +203,7 @@ def settle_places(read: Reading, seen: SeenThings) -> tuple[Reading, Objections,
             objections.append(fault)
             doubtful.add(box_of(thing))
 
-    def settled(thing: Thing) -> Thing:
+    def settled(thing: Place) -> Place:
         region = moved[box_of(thing)]
         update: dict[str, object] = {"is_doubtful": thing.is_doubtful or thing.bbox in doubtful}
         update |= {} if region is None else {"bbox": region.bbox, "bbox_deviation": None}
@@ -213,7 +213,7 @@ def settle_places(read: Reading, seen: SeenThings) -> tuple[Reading, Objections,
     return read.model_copy(update=update), tuple(objections), moved[box_of(mover)] is not None
 
 
-Thing = TypeVar("Thing", GroundingRequest, ObjectRequest)
+Place = TypeVar("Place", GroundingRequest, ObjectRequest)
 
 
 def mover_of(read: Reading) -> GroundingRequest:
@@ -228,15 +228,15 @@ def box_of(thing: GroundingRequest | ObjectRequest) -> BBox:
     return thing.bbox
 
 
-def onto_regions(boxes: Sequence[BBox], regions: Sequence[Region]) -> dict[BBox, Region | None]:
-    """For each box the region that it is about: none of its edges is far off, and no other box fits it better."""
+def onto_things(boxes: Sequence[BBox], things: Sequence[Thing]) -> dict[BBox, Thing | None]:
+    """For each box the thing that it is about: none of its edges is far off, and no other box fits it better."""
     pairs = [
         (iou(box, region.bbox), at, box, region)
         for box in boxes
-        for at, region in enumerate(regions)
+        for at, region in enumerate(things)
         if _is_about(box, region.bbox)
     ]
-    found = dict[BBox, Region | None].fromkeys(boxes)
+    found = dict[BBox, Thing | None].fromkeys(boxes)
     taken = set[int]()
     for _, at, box, region in sorted(pairs, key=lambda pair: -pair[0]):
         if found[box] is None and at not in taken:
@@ -250,16 +250,16 @@ def _is_about(box: BBox, region: BBox) -> bool:
     return all(abs(a - b) <= EDGE_OFF * side for a, b, side in zip(box, region, sides, strict=True))
 
 
-def fault_of(thing: GroundingRequest | ObjectRequest, region: Region | None, seen: SeenThings) -> str | None:
+def fault_of(thing: GroundingRequest | ObjectRequest, region: Thing | None, seen: SeenThings) -> str | None:
     """What speaks against the place of a thing."""
     name, box = thing.object or "", box_of(thing)
     if region is None and box in seen.bare:
         return f"In the box of '{name}' nothing stands."
     named = set(name.lower().split(" with ")[0].split())  # "a truck with a red cab" need not be red
-    region = region or next((each for each in seen.regions if is_same_object(each.bbox, box)), None)
+    region = region or next((each for each in seen.things if is_same_object(each.bbox, box)), None)
     if region is None or not named.isdisjoint((region.colour, *region.colours)):
         return None
-    there = [each for each in seen.regions if each.colour in named]
+    there = [each for each in seen.things if each.colour in named]
     if not there:
         return None
     x, y = there[0].centre

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from cow_service.media.images import encode_png, fit_within
+from cow_service.media.types import Floats, Image
 from cow_service.narration.warnings import warnings_of
 from cow_service.physics.ballistic import FreePath
 from cow_service.physics.bodies import SeenBody
@@ -18,25 +19,27 @@ from cow_service.physics.recording import record_trajectory
 from cow_service.physics.world import WorldInput
 from cow_service.records import CLEAR, BBox, CandidateOutcome, Doubt, Grounding, Motion, Outcome, Trajectory
 from cow_service.requests import SimulateRequest
-from cow_service.stages.keys import StageResult
+from cow_service.stages.grounding import look_again
+from cow_service.stages.keys import EstimatedDepth, StageResult
 from cow_service.stages.reconstruction import reconstruct
 from cow_service.stages.run import Run
 from cow_service.stages.seeing import Situation, see
-from cow_service.vision.types import Floats, Image
 
 SPRITE_SIDE = 256  # px, at most: sprites are seen while somebody drags
 
 
-def compute_trajectory(run: Run[SimulateRequest], grounding: Grounding, motion: Motion) -> StageResult[Trajectory]:
+def compute_trajectory(
+    run: Run[SimulateRequest], grounding: Grounding, motion: Motion, depth: EstimatedDepth | None = None
+) -> StageResult[Trajectory]:
     """The world over the whole clip; a path from the request is followed through everything."""
     with run.cpu():
-        scene = run.scene_of(grounding, motion.cue)
-        situation = see(run, scene, grounding, motion)
+        observation = look_again(run, grounding, motion.cue)
+        situation = see(run, observation, grounding, motion, depth)
         world, query, path = reconstruct(situation)
         trajectory = simulate_world(situation, world, query, path)
         live = live_worlds(world, query, run.request.ensemble) if run.request.live else None
         for body, told in zip(world.bodies, [] if live is None else live["bodies"], strict=False):
-            told["sprite"] = cut_out(scene.undrawn, body)
+            told["sprite"] = cut_out(observation.undrawn, body)
     warnings = warnings_of(run.request, grounding, trajectory)
     if live is None:
         return StageResult(value=trajectory, warnings=warnings)

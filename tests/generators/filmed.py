@@ -9,9 +9,10 @@ from drawn import ball, block, floor
 
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import CutoutOptions
+from cow_service.perception.observation import look
 from cow_service.physics.camera import FloorCamera
 from cow_service.records import Grounding, LocatedObject, Motion, Trajectory
-from cow_service.vision.scene import Scene
+from cow_service.stages.generation import scene_of
 
 RED, BLUE, GREEN = (210, 20, 20), (50, 80, 200), (30, 160, 60)
 CENTRE, RADIUS = (160.0, 200.0), 40.0
@@ -27,8 +28,8 @@ def ignore(done: float) -> None:
 
 def shot(image, points, scale=None, depths=None, clean: bool = True, bbox=None, named=(), **more) -> GeneratorInput:
     """A clip of what is at `CENTRE`, or in a box, along points (px), without a camera."""
-    scene = Scene(image)
-    bbox = scene.bbox_at(CENTRE) if bbox is None else bbox
+    seen = look(image)
+    bbox = seen.mask_at(CENTRE).bbox if bbox is None else bbox
     others = tuple(LocatedObject(object=f"thing {i}", bbox=box) for i, box in enumerate(named))
     middle = ((bbox[0] + bbox[2]) / 2, (bbox[1] + bbox[3]) / 2)
     grounding = Grounding(object="thing", point=middle, bbox=bbox, others=others, source="request")
@@ -43,7 +44,7 @@ def shot(image, points, scale=None, depths=None, clean: bool = True, bbox=None, 
         "scale": [1.0] * count if scale is None else scale, "tracks": [points],
     }  # fmt: skip
     trajectory = Trajectory.model_validate({"fps": 16, "paths": [path], "anchors": []} | more)
-    obstacles = scene.obstacles(bbox, others)
+    obstacles, scene = seen.obstacles(bbox, others), scene_of(seen, grounding, trajectory)
     return GeneratorInput(scene, grounding, motion, trajectory, obstacles, 0, CutoutOptions(clean_cues=clean))
 
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import MAX_SIDE, CutoutGenerator
 from cow_service.generators.cutout.layers import take_apart
+from cow_service.media.masks import CroppedMask
 
 generator = CutoutGenerator()
 
@@ -249,7 +250,7 @@ def test_a_ball_partly_hidden_at_the_start_is_whole_later() -> None:
     x0, y0, x1, y1 = world.bodies[1]["bbox"]
     whole = np.hypot(xs - x, ys - y) < r
     seen = whole & ~((xs > x0) & (xs < x1) & (ys > y0) & (ys < y1))
-    frame = frame_of(replace(filmed, scene=filmed.scene.with_mask(filmed.grounding.bbox, seen)), 1)
+    frame = frame_of(replace(filmed, scene=replace(filmed.scene, mover=CroppedMask.of(seen))), 1)
     assert redness(frame).sum() > 0.93 * whole.sum()
 
 

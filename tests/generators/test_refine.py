@@ -76,7 +76,7 @@ def test_what_is_put_elsewhere_is_drawn_there_and_refined_from_the_image_on(refi
     assert with_put(given, after) is given, "nothing is put elsewhere"
     assert given.before is not None
     assert given.grounding.bbox == pytest.approx((to_x - to_r, to_y - to_r, to_x + to_r, to_y + to_r))
-    mask = given.scene.silhouette(given.grounding.bbox)
+    mask = given.scene.mover.full()
     expected = np.hypot(*(np.indices(mask.shape)[::-1] + 0.5 - np.array([to_x, to_y])[:, None, None])) < to_r
     assert np.count_nonzero(mask ^ expected) < 0.06 * np.count_nonzero(expected)
     image = given.scene.image.astype(int)

@@ -142,7 +142,7 @@ def test_a_cancel_takes_effect_within_one_step(toys, ati, scene, monkeypatch) ->
 
 def test_text_and_image_are_encoded_once_and_the_image_with_or_without_cues(ati, scene, monkeypatch) -> None:
     marked = np.zeros_like(scene.scene.image)
-    drawn = replace(scene, scene=scene.scene.changed(marked, scene.scene.clean))
+    drawn = replace(scene, scene=replace(scene.scene, image=marked))
     clip(ati, scene, steps=1)
     calls = count(monkeypatch, ati.pipeline, "encode_prompt", "embed_image")
     clip(ati, drawn, steps=1, seed=7, prompt="new words")

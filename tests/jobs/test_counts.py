@@ -132,7 +132,7 @@ def test_pixels_of_a_question_are_given_back_at_once(service: Service) -> None:
     try:
         run = service.prepare(request)
         simulate(run)
-        alive = weakref.ref(run), weakref.ref(run.scene)
+        alive = weakref.ref(run), weakref.ref(run.sight.look())
         del run
         assert [each() for each in alive] == [None, None]
     finally:

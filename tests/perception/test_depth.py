@@ -17,13 +17,13 @@ from hypothesis import strategies as st
 from refusals import refused
 from servers import data_url
 
+from cow_service.media.masks import CroppedMask
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.geometry import DepthMap, Floor, Footprint, find_floor, measure
 from cow_service.records import Outcome, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.vision.masks import CroppedMask
 
 SIZE = 640, 400
 CAMERA = TrueCamera(pitch=28, focal=640)

@@ -28,6 +28,8 @@ from stand_in_models import StandInSegmenter
 from stand_ins import TrueModels, TrueScene, TrueSegmenter, motorcycle, read_truth
 
 from cow_service.media.images import decode_own, encode_png
+from cow_service.media.masks import bbox_of, mask_iou
+from cow_service.media.types import Mask
 from cow_service.perception.base import MOST_EMBEDDINGS, Embedded, Perception, Prompt, Segment
 from cow_service.perception.outlines import outlines_at, outlines_in
 from cow_service.readers.base import ReadResult
@@ -36,8 +38,6 @@ from cow_service.requests import AnswerRequest, LookRequest, SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings, SettingsError
 from cow_service.stages.grounding import ground
-from cow_service.vision.masks import bbox_of, mask_iou
-from cow_service.vision.types import Mask
 
 pytestmark = pytest.mark.slow
 

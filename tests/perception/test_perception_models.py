@@ -14,9 +14,9 @@ import pytest
 from hub import Blob, Hub, running
 from refusals import refused
 
+from cow_service.media.types import Image
 from cow_service.perception.base import Prompt
 from cow_service.settings import Settings
-from cow_service.vision.types import Image
 from cow_service.weights.manifests import find_manifest
 from cow_service.weights.repositories import download, resolve
 

@@ -13,6 +13,7 @@ from floors import TrueCamera, known, outline
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from cow_service.media.masks import CroppedMask
 from cow_service.physics.bodies import NOTHING_SAID, SeenBody, supports_of
 from cow_service.physics.camera import FloorCamera, prior
 from cow_service.physics.draws import ensemble, likeliest
@@ -21,7 +22,6 @@ from cow_service.physics.layout import BOX_SIDE, lay_out
 from cow_service.physics.lift import Cameras, above, in_the_air
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import MetresPerPixel, Motion, ObjectPrior
-from cow_service.vision.masks import CroppedMask
 
 METRES = 3 / 640  # per pixel
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cow_service.media.masks import CroppedMask
 from cow_service.physics.events import SeenPaths, Shares
 from cow_service.physics.events import shares as shares_of
-from cow_service.vision.masks import CroppedMask
 
 
 def block(x0: int, y0: int, x1: int, y1: int) -> CroppedMask:

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cow_service.media.masks import CroppedMask
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
 from cow_service.physics.camera import depth_motion
 from cow_service.physics.tracks import points_inside, spread_anchors, swept
 from cow_service.records import DIRECTED_KINDS, FALLING_KINDS, Grounding, MetresPerPixel, Motion, Path
 from cow_service.requests import TrajectoryRequest
-from cow_service.vision.masks import CroppedMask
 
 
 def test_what_goes_straight_away_over_the_floor_rises_in_the_image() -> None:

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cow_service.media.masks import CroppedMask, hull
 from cow_service.physics.camera import FloorCamera
 from cow_service.physics.tracks import Density, lifted, with_tracks
 from cow_service.records import Body, CameraEstimate, Footprint, Trajectory
 from cow_service.records import Path as BodyPath
-from cow_service.vision.masks import CroppedMask, hull
 
 WIDTH, HEIGHT, FRAMES = 640, 400, 41
 ESTIMATE = CameraEstimate.model_validate(

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from worlds import CAMERA, FPS, FRAMES, HALF, SPEED, ball, happened, post, rigid, rolling, seen
 
+from cow_service.media.masks import CroppedMask
 from cow_service.physics.bodies import SeenBody
 from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.engine import Meeting, RigidShape, WorldRun, run_worlds
@@ -22,7 +23,6 @@ from cow_service.physics.events import Events, WorldEvents, encounters, find_wor
 from cow_service.physics.recording import rotation, states
 from cow_service.physics.world import DrawnWorlds, WorldInput, run_world
 from cow_service.records import Asked
-from cow_service.vision.masks import CroppedMask
 
 
 def kinds(events: Events, body: int = 1) -> set[str]:

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from mllm_server import completion, mllm_server
 
 from cow_service.adaptive import FIRST, MAX_PAUSE_SECONDS, AdaptiveLimit
+from cow_service.perception.observation import look
 from cow_service.readers.base import ReaderInput
 from cow_service.settings import Settings
-from cow_service.vision.scene import Scene
 
 pytestmark = pytest.mark.slow
 
@@ -188,7 +188,7 @@ def test_an_mllm_is_called_more_often_at_once_as_it_accepts_more(tmp_path) -> No
         mllm.say(reply)
         asked = {"question": "How many?", "shown": "nothing", "facts": ()}
         prompts = [PromptCall("eval-question", asked, (), {"type": "object"}, int, vote) for vote in range(calls)]
-        replies = client.complete_all(prompts, ReaderInput(Scene(floor(8, 8)), "How many?"))
+        replies = client.complete_all(prompts, ReaderInput(floor(8, 8), "How many?", look(floor(8, 8))))
         client.close()
     assert replies == [42] * calls
     assert most > FIRST

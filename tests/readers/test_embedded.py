@@ -15,6 +15,8 @@ from refusals import refused
 from runs import run_of
 
 from cow_service.errors import CowError
+from cow_service.media.masks import iou
+from cow_service.perception.observation import Observation, look
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import ReaderInput, ReadResult
 from cow_service.readers.embedded.reader import EmbeddedReader
@@ -34,34 +36,32 @@ from cow_service.records import (
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import settle_motion
 from cow_service.stages.run import Run
-from cow_service.vision.masks import iou
-from cow_service.vision.scene import Scene
 
 RED, BLUE, GREEN, ORANGE = (200, 30, 30), (50, 80, 200), (50, 150, 50), (235, 130, 40)
 reader = EmbeddedReader()
 
 
 @cache
-def drawn(arrow: float | None = None) -> Scene:
+def drawn(arrow: float | None = None) -> Observation:
     """A red ball left, a blue block right; an arrow at the ball to the right (0.2) or to the left (3.0)."""
     image = block(ball(floor(), (150, 200), 40, RED), (430, 150, 520, 250), BLUE)
     if arrow is not None:
         image = DrawnArrow((200, 200), arrow, 110, 5, (30, 160, 30), "filled").on(image)
-    return Scene(jpeg(image))
+    return look(jpeg(image))
 
 
 @cache
-def three() -> Scene:
+def three() -> Observation:
     """A red ball left, a green one in the middle, a blue block right."""
     image = ball(ball(floor(), (110, 200), 40, RED), (300, 200), 40, GREEN)
-    return Scene(jpeg(block(image, (430, 150, 520, 250), BLUE)))
+    return look(jpeg(block(image, (430, 150, 520, 250), BLUE)))
 
 
-def said(scene: Scene, question: str, **known: Any) -> ReadResult:
-    return reader.read(ReaderInput(scene, question, given=Reading(**known)))
+def said(scene: Observation, question: str, **known: Any) -> ReadResult:
+    return reader.read(ReaderInput(scene.image, question, scene, given=Reading(**known)))
 
 
-def found(scene: Scene, question: str, **known: Any) -> Reading:
+def found(scene: Observation, question: str, **known: Any) -> Reading:
     return said(scene, question, **known).reading
 
 
@@ -75,7 +75,7 @@ def names(reading: Reading) -> list[str]:
     return [each.object for each in reading.objects]
 
 
-def settled(scene: Scene, question: str) -> tuple[Run, Motion]:
+def settled(scene: Observation, question: str) -> tuple[Run, Motion]:
     """What the stages make of what is read."""
     run = run_of(scene.image, reader=lambda: reader, question=question)
     grounding = run.stage("grounding", ground)
@@ -86,7 +86,7 @@ def asking(words: str) -> str:
     return f"If the red ball {words}, will it hit the blue cube?"
 
 
-def motion_of(words: str, scene: Scene | None = None) -> Motion:
+def motion_of(words: str, scene: Observation | None = None) -> Motion:
     return settled(scene or drawn(), asking(words))[1]
 
 
@@ -114,10 +114,10 @@ def test_colour_and_arrow() -> None:
 
 
 @cache
-def five() -> Scene:
+def five() -> Observation:
     """Three red balls of different sizes and heights in the image, a green one and a blue block."""
     image = ball(ball(ball(floor(), (110, 220), 40, RED), (300, 120), 30, RED), (480, 230), 55, RED)
-    return Scene(jpeg(block(ball(image, (210, 330), 36, GREEN), (560, 60, 620, 130), BLUE)))
+    return look(jpeg(block(ball(image, (210, 330), 36, GREEN), (560, 60, 620, 130), BLUE)))
 
 
 def test_words_of_place_and_size_single_one_out() -> None:
@@ -132,22 +132,22 @@ def test_words_of_place_and_size_single_one_out() -> None:
 def test_what_singles_a_thing_out() -> None:
     assert iou(mover_box(found(drawn(), "If the ball moves left, what happens?")), (110, 160, 190, 240)) > 0.8
     twins = ball(ball(floor(), (150, 200), 40, RED), (450, 200), 40, RED)
-    at_arrow = Scene(jpeg(DrawnArrow((500, 200), 0.0, 90, 5, (20, 60, 200), "open").on(twins)))
+    at_arrow = look(jpeg(DrawnArrow((500, 200), 0.0, 90, 5, (20, 60, 200), "open").on(twins)))
     at_it = found(at_arrow, "If the ball moves in the direction of the arrow, where does it go?")
     assert mover_box(at_it)[0] > 400
     boxed = ball(ball(floor(), (150, 200), 40, RED), (450, 200), 40, GREEN)
     cv2.rectangle(boxed, (395, 145), (505, 255), (230, 200, 20), 3)
     asked = "If the object inside the yellow box moves left, will it hit the red ball?"
-    assert mover_box(found(Scene(jpeg(boxed)), asked))[0] > 400
+    assert mover_box(found(look(jpeg(boxed)), asked))[0] > 400
     image = block(block(floor(), (400, 200, 540, 260), BLUE), (430, 160, 510, 202), BLUE)
-    vehicle = Scene(jpeg(block(ball(image, (150, 200), 40, RED), (260, 150, 340, 240), GREEN)))
+    vehicle = look(jpeg(block(ball(image, (150, 200), 40, RED), (260, 150, 340, 240), GREEN)))
     x0, _, x1, _ = mover_box(found(vehicle, "If the bus moves left, what happens?"))  # what is longer than high
     assert (x0 + x1) / 2 == pytest.approx(470, abs=6)
 
 
 def test_a_thing_is_meant_by_evidence_and_never_because_it_is_left() -> None:
     """A lone noun is no name of the only thing there is, unless the outline is that of the noun."""
-    block_alone = Scene(jpeg(block(floor(), (430, 130, 505, 250), RED)))
+    block_alone = look(jpeg(block(floor(), (430, 130, 505, 250), RED)))
     for name in ("soccer ball", "kettle", "vase"):
         with refused("cannot-ground"):
             found(block_alone, f"If the {name} slides right, what happens?")
@@ -204,7 +204,7 @@ def test_what_is_taken_away_and_where_things_are_put() -> None:
     assert reading.grounding is not None
     assert reading.grounding.object == "red ball"
     image = block(ball(floor(), (110, 200), 40, RED), (250, 150, 330, 230), GREEN)
-    both = Scene(jpeg(block(image, (430, 150, 520, 235), BLUE)))
+    both = look(jpeg(block(image, (430, 150, 520, 235), BLUE)))
     reading = found(both, "If both cubes are taken away and the red ball rolls right, will it hit anything?")
     assert {change.object for change in reading.interventions} == {"green cube", "blue cube"}
 
@@ -212,7 +212,7 @@ def test_what_is_taken_away_and_where_things_are_put() -> None:
 def test_things_of_one_kind_and_colour_have_names_of_their_own() -> None:
     """A change names what it is about: two red cubes are told apart."""
     image = block(ball(floor(), (110, 300), 40, GREEN), (250, 150, 330, 230), RED)
-    twins = Scene(jpeg(block(image, (430, 150, 510, 230), RED)))
+    twins = look(jpeg(block(image, (430, 150, 510, 230), RED)))
     reading = found(twins, "If both cubes are taken away and the green ball rolls right, will it hit anything?")
     assert len({change.object for change in reading.interventions}) == 2
     reading = found(twins, "If I put the green ball between the cubes, will it fit?")
@@ -268,7 +268,7 @@ def test_a_refusal_says_what_was_looked_for_and_what_is_seen() -> None:
     assert "grounding.point" in caught.value.remedy
     image = ball(block(floor(), (430, 150, 520, 250), RED), (150, 200), 40, RED)
     with refused("cannot-ground"):  # "one" is no noun
-        found(Scene(jpeg(image)), "If the red one slides left, what happens?")
+        found(look(jpeg(image)), "If the red one slides left, what happens?")
 
 
 # How it moves
@@ -330,7 +330,7 @@ def test_of_what_is_given_the_words_or_the_arrow_alone_tell_the_motion() -> None
     """Neither a goal nor a mover need be named as one that was located."""
     place = {"object": "red ball", "bbox": (110, 160, 190, 240)}
 
-    def motion(scene: Scene, question: str) -> Motion:
+    def motion(scene: Observation, question: str) -> Motion:
         run = run_of(scene.image, reader=lambda: reader, question=question, grounding=place)
         return run.stage("motion", settle_motion, run.stage("grounding", ground), None)
 
@@ -402,14 +402,14 @@ def test_arrows_that_may_not_be_the_movers_are_not_followed() -> None:
         two = DrawnArrow(start, angle, 100, 5, (20, 60, 200), "filled").on(two)
     for scene in (elsewhere, two):
         with refused("cannot-read-direction"):
-            settled(Scene(jpeg(scene)), "If the red ball moves along the arrow, what happens?")
+            settled(look(jpeg(scene)), "If the red ball moves along the arrow, what happens?")
     run, motion = settled(drawn(0.2), asking("moves along the arrow to the left"))  # the arrow does not point there
     assert (motion.cue, motion.other_direction) == ("arrow", (-1.0, 0.0))
     assert any("contradict the arrow" in warning for warning in run.warnings("motion"))
     motion = motion_of("moves along the arrow to the right", drawn(0.2))
     assert motion.direction == pytest.approx(DrawnArrow((0, 0), 0.2, 1, 1, RED, "").direction, abs=0.03)
     assert motion.other_direction is None
-    twins = Scene(jpeg(ball(ball(ball(floor(), (150, 200), 40, RED), (450, 200), 40, RED), (300, 270), 30, BLUE)))
+    twins = look(jpeg(ball(ball(ball(floor(), (150, 200), 40, RED), (450, 200), 40, RED), (300, 270), 30, BLUE)))
     with refused("cannot-read-direction"):
         settled(twins, "If the blue ball moves towards the red ball, what happens?")
 

@@ -14,14 +14,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runs import run_of
 
-from cow_service.perception.facing import DARK, OTHER, PAINT, VehicleModel, facing
+from cow_service.media.masks import bbox_of, iou
+from cow_service.media.types import Image, Mask
+from cow_service.perception.classical.facing import DARK, OTHER, PAINT, VehicleModel, facing
+from cow_service.perception.observation import look
 from cow_service.physics.camera import FloorCamera
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import settle_motion
-from cow_service.vision.masks import bbox_of, iou
-from cow_service.vision.scene import Scene
-from cow_service.vision.types import Image, Mask
 
 pytestmark = pytest.mark.slow
 
@@ -86,11 +86,11 @@ def test_a_rendered_car_is_whole_and_faces_its_way(name: str) -> None:
     truth = TRUTH[name]
     pixels = cv2.imread(str(VEHICLES / f"{name}.jpg"))
     assert pixels is not None
-    scene = Scene(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8))
-    region = scene.region_of(tuple(truth["bbox"]))
+    scene = look(np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8))
+    region = scene.thing_in(tuple(truth["bbox"]))
     assert region is not None
     assert iou(region.bbox, tuple(truth["bbox"])) > 0.8
     assert not any(iou(other.bbox, region.bbox) > 0 for other in scene.obstacles(region.bbox))
-    way = facing(scene.clean, scene.silhouette(region.bbox), region.bbox)
+    way = facing(scene.clean, scene.mask_in(region.bbox).full(), region.bbox)
     assert way is not None
     assert angle_between(way, tuple(truth["direction"])) <= 10

@@ -10,14 +10,15 @@ import pytest
 from conftest import DATA
 from drawn import Image, ball, block, floor, jpeg
 
+from cow_service.media.masks import CroppedMask
+from cow_service.perception.base import Thing
+from cow_service.perception.classical.forms import form_of, is_unlike
+from cow_service.perception.classical.regions import find_regions
+from cow_service.perception.observation import look
 from cow_service.physics.bodies import SeenBody
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.noun_phrases import parse_noun_phrase
 from cow_service.readers.embedded.matching import best_matches, match_one, noun_doubts
-from cow_service.vision.forms import form_of, is_unlike
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.regions import Region, find_regions
-from cow_service.vision.scene import Scene
 
 PURPLE, GREEN = (120, 60, 170), (50, 150, 50)
 HALF_WIDTHS = {  # at equal steps from the upper end
@@ -36,7 +37,7 @@ def turned(image: Image, middle: int, noun: str) -> Image:
     return image
 
 
-def region_of(image: Image) -> Region:
+def region_of(image: Image) -> Thing:
     (region,) = find_regions(jpeg(image))
     return region
 
@@ -77,8 +78,8 @@ def test_a_squat_cylinder_seen_from_above_is_one() -> None:
 
 
 def test_without_a_colour_nothing_is_meant_that_looks_like_something_else() -> None:
-    scene = Scene(np.ascontiguousarray(cv2.imread(str(DATA / "wordings" / "bottles.jpg"))[..., ::-1]))
-    bottle = next(each for each in scene.regions if each.colour == "pink")
+    scene = look(np.ascontiguousarray(cv2.imread(str(DATA / "wordings" / "bottles.jpg"))[..., ::-1]))
+    bottle = next(each for each in scene.things if each.colour == "pink")
     doubted = [bool(noun_doubts(scene, [(phrase_of(text), bottle.bbox)])[1]) for text in ("the candle", "the bottle")]
     assert doubted == [True, False]
 
@@ -89,7 +90,7 @@ def phrase_of(text: str) -> ObjectPhrase:
     return phrase
 
 
-def matches(regions: tuple[Region, ...], text: str) -> list[int]:
+def matches(regions: tuple[Thing, ...], text: str) -> list[int]:
     return sorted(round(region.centre[0]) for region in best_matches(regions, phrase_of(text)))
 
 

@@ -16,10 +16,10 @@ from waiting import TIME_LIMIT
 
 from cow_service.errors import MllmUnavailable
 from cow_service.media.images import decode
+from cow_service.perception.observation import look
 from cow_service.readers.base import ReaderInput
 from cow_service.records import MllmMeasurement
 from cow_service.settings import Settings
-from cow_service.vision.scene import Scene
 
 if TYPE_CHECKING:
     from cow_service.readers.mllm.check import MllmCheck
@@ -148,7 +148,7 @@ def test_other_coordinates_are_noticed_and_kept(
     reader, true = reader_of(mllm, tmp_path), TRUE["ball-and-mug"]
     assert reader.fingerprint != first.fingerprint, "results of before are not reused"
     pixels = decode((EXAMPLES / "ball-and-mug" / "image.jpg").read_bytes()).pixels
-    found = reader.read(ReaderInput(Scene(pixels), true["question"])).reading.grounding
+    found = reader.read(ReaderInput(pixels, true["question"], look(pixels))).reading.grounding
     reader.close()
     again = checked(mllm, tmp_path, model(**written))
     assert usable(again)["box"], "they are asked for now"

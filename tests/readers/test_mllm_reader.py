@@ -24,6 +24,7 @@ from runs import run_of
 from waiting import TIME_LIMIT, eventually
 
 from cow_service.errors import Canceled, CowError
+from cow_service.perception.observation import Observation, look
 from cow_service.readers.base import AnswerReading, CallLog, ReaderInput, ReadResult, WordsReading
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.readers.options import read_choices
@@ -41,10 +42,9 @@ from cow_service.records import (
     Usage,
 )
 from cow_service.settings import Settings
-from cow_service.stages.grounding import ground
+from cow_service.stages.grounding import ground, look_again
 from cow_service.stages.motion import settle_motion
 from cow_service.stages.trajectory import compute_trajectory
-from cow_service.vision.scene import Scene
 
 if TYPE_CHECKING:
     from cow_service.readers.mllm.reader import MllmReader
@@ -87,8 +87,8 @@ def reader(make) -> MllmReader:
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    return Scene(block(ball(floor(), (150, 200), 40, (200, 30, 30)), (430, 150, 520, 250), (50, 80, 200)))
+def scene() -> Observation:
+    return look(block(ball(floor(), (150, 200), 40, (200, 30, 30)), (430, 150, 520, 250), (50, 80, 200)))
 
 
 def known(source: Source = "mllm", **said: Any) -> Reading:
@@ -107,7 +107,7 @@ def names(result: ReadResult) -> list[str]:
 
 
 def answers(reader: MllmReader, votes: int = 1, **given: Any) -> tuple[AnswerReading, ...]:
-    return reader.answer(ReaderInput(Scene(floor(64, 64)), "Will it?", **given), OPTIONS, None, None, votes)
+    return reader.answer(ReaderInput(floor(64, 64), "Will it?", **given), OPTIONS, None, None, votes)
 
 
 # What is asked and handed on
@@ -115,7 +115,7 @@ def answers(reader: MllmReader, votes: int = 1, **given: Any) -> tuple[AnswerRea
 
 def test_place_and_motion_are_read_at_once(mllm, reader, scene) -> None:
     mllm.say(json.dumps(BALL), json.dumps(PLACE))
-    result = reader.read(ReaderInput(scene, QUESTION))
+    result = reader.read(ReaderInput(scene.image, QUESTION, scene))
     assert result.reading.grounding is not None
     assert result.reading.grounding.object == "red ball"
     assert len(mllm.asked) == 2
@@ -124,7 +124,7 @@ def test_place_and_motion_are_read_at_once(mllm, reader, scene) -> None:
     assert motion.direction == pytest.approx((0.37 * scene.width, 0), abs=1)
     # A motion that the request gives is not asked for.
     mllm.say(json.dumps(BALL), json.dumps(PLACE))
-    assert reader.read(ReaderInput(scene, QUESTION, motion_wanted=False)).reading.motion is None
+    assert reader.read(ReaderInput(scene.image, QUESTION, scene, motion_wanted=False)).reading.motion is None
     assert list(mllm.asked[-1]["response_format"]["json_schema"]["schema"]["properties"]) == ["reasoning", "objects"]
 
 
@@ -148,7 +148,7 @@ def test_what_is_taken_away_or_asked_about_is_located_and_how_far_it_goes_is_kep
     boxes = [("blue vase", [600, 400, 700, 600]), ("coin", [800, 400, 900, 600])]
     others = [{"label": name, "bbox_2d": box} for name, box in boxes]
     mllm.say(json.dumps(said | ends), json.dumps(PLACE | {"others": others}))
-    result = reader.read(ReaderInput(scene, question))
+    result = reader.read(ReaderInput(scene.image, question, scene))
     assert {"> blue vase", "> coin"} <= set(mllm.text(1).splitlines())
     assert result.reading.interventions == (InterventionRequest(kind="remove", object="blue vase"),)
     assert {(each.object, each.role) for each in result.reading.objects} == {
@@ -162,7 +162,7 @@ def test_what_is_taken_away_or_asked_about_is_located_and_how_far_it_goes_is_kep
     assert motion.until == "contact"
     mllm.say(json.dumps(said), json.dumps(PLACE))
     with refused("object-not-found"):
-        reader.read(ReaderInput(scene, QUESTION))
+        reader.read(ReaderInput(scene.image, QUESTION, scene))
 
 
 def test_further_legs_and_other_movers_are_kept(mllm, reader, scene) -> None:
@@ -172,7 +172,7 @@ def test_further_legs_and_other_movers_are_kept(mllm, reader, scene) -> None:
     named = json.dumps(BALL | {"then": then, "also_moving": [car, cup, {"object": None}]})
     mllm.say(named, json.dumps(PLACE | {"others": boxes}))
     lamp = Reading(objects=(ObjectRequest(object="tall lamp"),))
-    result = reader.read(ReaderInput(scene, QUESTION, given=lamp))
+    result = reader.read(ReaderInput(scene.image, QUESTION, scene, given=lamp))
     assert {"> blue car", "> tall lamp"} <= set(mllm.text(1).splitlines()), "what the request changes is located, too"
     motion = motion_of(result)
     assert [(each.direction, each.distance, each.duration) for each in motion.steps] == [
@@ -184,7 +184,7 @@ def test_further_legs_and_other_movers_are_kept(mllm, reader, scene) -> None:
     )
     mllm.say(named, json.dumps(PLACE))
     with refused("cannot-read-direction"):
-        reader.read(ReaderInput(scene, QUESTION))
+        reader.read(ReaderInput(scene.image, QUESTION, scene))
 
 
 def test_a_trail_that_the_model_sees_is_one_whatever_the_language(mllm, reader) -> None:
@@ -204,13 +204,13 @@ def test_a_trail_that_the_model_sees_is_one_whatever_the_language(mllm, reader) 
     assert motion.cue == "trail"
     assert [round(x) for x, _ in motion.trail] == pytest.approx([120, 215], abs=2)
     # The earlier positions are taken out of the image.
-    assert sorted(region.colour for region in run.scene_of(found, motion.cue).regions) == ["green", "orange"]
+    assert sorted(thing.colour for thing in look_again(run, found, motion.cue).things) == ["green", "orange"]
 
 
 @pytest.mark.parametrize("source", ["request", "mllm"])
 def test_the_motion_alone_is_asked_for_with_the_box_that_is_known(source: Source, mllm, reader, scene) -> None:
     mllm.say(json.dumps(BALL), json.dumps(PLACE))
-    asked = ReaderInput(scene, QUESTION, given=known(source))
+    asked = ReaderInput(scene.image, QUESTION, scene, given=known(source))
     result = reader.read(asked)
     assert motion_of(result).direction is not None
     assert result.reading.model_copy(update={"motion": None}) == Reading(), "and nothing else is said"
@@ -227,8 +227,8 @@ def test_the_motion_alone_is_asked_for_with_the_box_that_is_known(source: Source
 
 
 def test_large_images_are_made_smaller_and_pixels_count_in_what_was_sent(mllm, make) -> None:
-    place = GroundingRequest(object="car", bbox=(1600, 800, 2400, 1200))
-    asked = ReaderInput(Scene(floor(4000, 2000)), "Where does the car go?", given=Reading(grounding=place))
+    place, image = GroundingRequest(object="car", bbox=(1600, 800, 2400, 1200)), floor(4000, 2000)
+    asked = ReaderInput(image, "Where does the car go?", look(image), given=Reading(grounding=place))
     way = np.array([math.cos(0.3), math.sin(0.3)])
 
     def line(handler) -> None:
@@ -253,9 +253,9 @@ def test_large_images_are_made_smaller_and_pixels_count_in_what_was_sent(mllm, m
 # Places, and what else is not asked for
 
 
-def placed(mllm: MllmServer, reader: MllmReader, scene: Scene, reply: dict[str, Any]) -> ReadResult:
+def placed(mllm: MllmServer, reader: MllmReader, scene: Observation, reply: dict[str, Any]) -> ReadResult:
     mllm.say(json.dumps(BALL | {"others": ["vase"]}), json.dumps(PLACE | LINE | reply))
-    asked = ReaderInput(scene, "If the red ball rolls to the right, will it hit the vase?")
+    asked = ReaderInput(scene.image, "If the red ball rolls to the right, will it hit the vase?", scene)
     result = reader.read(asked)
     assert len(mllm.asked) == 2, "nothing was asked again"
     return result
@@ -292,7 +292,7 @@ def test_a_part_that_cannot_be_used_is_asked_for_once_more_then_left_out_aloud(m
         ([unread, whole], ["vase"], 0), ([unread, unread], [], 1), ([unread, "no idea"], [], 1),
     ):  # fmt: skip
         mllm.say(named, *script)
-        result = reader.read(ReaderInput(scene, QUESTION))
+        result = reader.read(ReaderInput(scene.image, QUESTION, scene))
         assert len(mllm.asked) == 3
         assert "without a label and a box" in mllm.text(-1)
         assert names(result) == found
@@ -302,13 +302,13 @@ def test_a_part_that_cannot_be_used_is_asked_for_once_more_then_left_out_aloud(m
 def test_objections_to_a_reading_are_put_to_the_model(mllm, reader, scene) -> None:
     objection = "The box of 'red ball' lies\nwhere nothing stands."
     mllm.say(json.dumps(BALL), json.dumps(PLACE))
-    reader.read(ReaderInput(scene, QUESTION, objections=(objection,)))
+    reader.read(ReaderInput(scene.image, QUESTION, scene, objections=(objection,)))
     for call in (0, 1):
         assert "> The box of 'red ball' lies where nothing stands." in mllm.text(call).splitlines()
     against = json.dumps({"cue": "arrow", "sense": "against", "start": [230, 500], "end": [30, 500]})
     mllm.say(against)
     asked = ReaderInput(
-        scene, QUESTION, given=known(motion={"kind": "linear"}), objections=("It moves the other way.",)
+        scene.image, QUESTION, scene, given=known(motion={"kind": "linear"}), objections=("It moves the other way.",)
     )
     motion = motion_of(reader.read(asked))
     assert "> It moves the other way." in mllm.text(0).splitlines()
@@ -322,7 +322,7 @@ def test_what_the_caller_says_is_not_asked(mllm, reader, scene) -> None:
     said = Reading(
         asked=Asked(relation="touches"), interventions=(InterventionRequest(kind="remove", object="red ball"),)
     )
-    reader.read(ReaderInput(scene, QUESTION, given=said, motion_wanted=False))
+    reader.read(ReaderInput(scene.image, QUESTION, scene, given=said, motion_wanted=False))
     schema = mllm.asked[0]["response_format"]["json_schema"]["schema"]
     assert list(schema["properties"]) == ["reasoning", "object", "others", "language"]
     assert not any(f"`{field}`" in mllm.text(0) for field in ("asked", "changes", "kind", "then"))
@@ -337,7 +337,7 @@ def words_of(question: str) -> WordsReading:
 
 def test_one_call_is_enough_where_the_words_say_the_rest(mllm, reader, scene) -> None:
     mllm.say(json.dumps({"objects": [{"bbox_2d": [172, 390, 297, 590], "label": "red ball"}, VASE], **LINE}))
-    result = reader.read(ReaderInput(scene, ROLLS, words=words_of(ROLLS)))
+    result = reader.read(ReaderInput(scene.image, ROLLS, scene, words=words_of(ROLLS)))
     assert len(mllm.asked) == 1
     assert "The object that moves is this one" in mllm.text(0)
     assert {"> red ball", "> vase"} <= set(mllm.text(0).splitlines())
@@ -363,7 +363,7 @@ def test_one_call_is_enough_where_the_words_say_the_rest(mllm, reader, scene) ->
 )
 def test_words_that_leave_something_open_do_not_spare_a_call(question: str, mllm, reader, scene) -> None:
     mllm.say(json.dumps(BALL), json.dumps(PLACE | {"others": [VASE]}))
-    reader.read(ReaderInput(scene, question, words=words_of(question)))
+    reader.read(ReaderInput(scene.image, question, scene, words=words_of(question)))
     assert "Find out which one object" in mllm.text(0)
 
 
@@ -372,7 +372,7 @@ def test_of_several_arrows_the_model_says_which_is_meant(mllm, reader, scene) ->
     for y in (60, 340):
         image = DrawnArrow((200, y), 0.0, 110, 5, (30, 160, 30), "filled").on(image)
     mllm.say(json.dumps(BALL | {"others": ["vase"]}), json.dumps(PLACE | {"others": [VASE]}))
-    reading = reader.read(ReaderInput(Scene(image), ROLLS, words=words_of(ROLLS))).reading
+    reading = reader.read(ReaderInput(image, ROLLS, look(image), words=words_of(ROLLS))).reading
     assert "`asked`" not in mllm.text(0), "the words say it"
     assert len(mllm.asked) == 2
     assert reading.asked == Asked(relation="touches", target="vase")
@@ -515,7 +515,7 @@ def test_a_canceled_run_and_a_reader_that_closes_wait_no_longer(mllm, make, scen
             raise Canceled("The caller left.")
 
     with held(mllm), pytest.raises(Canceled):
-        closing.read(ReaderInput(scene, QUESTION, check_canceled=canceled))
+        closing.read(ReaderInput(scene.image, QUESTION, scene, check_canceled=canceled))
 
     def close() -> None:
         eventually(lambda: mllm.asked)
@@ -589,7 +589,7 @@ def test_the_cpu_is_held_for_work_and_never_while_the_model_is_waited_for(mllm, 
         handler.send(200, say.completion(json.dumps(text)))
 
     mllm.say(reply)
-    asked = ReaderInput(scene, QUESTION, cpu=cpu)
+    asked = ReaderInput(scene.image, QUESTION, scene, cpu=cpu)
     reader.read(asked)
     reader.answer(asked, (), None, None, votes=2)
     assert held == 0
@@ -651,4 +651,4 @@ def test_whatever_the_model_replies_is_read_or_refused(
     where = json.dumps(PLACE | LINE | {"others": boxes})
     mllm.say(replies)
     with suppress(CowError):
-        Reading.model_validate(reader.read(ReaderInput(scene, "Does it go 3 m?")).reading.model_dump())
+        Reading.model_validate(reader.read(ReaderInput(scene.image, "Does it go 3 m?", scene)).reading.model_dump())

@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 from mllm_server import MllmServer
 from waiting import TIME_LIMIT
 
+from cow_service.perception.observation import look
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.options import read_choices
 from cow_service.settings import Settings
-from cow_service.vision.scene import Scene
 
 REPLY = json.dumps({"reasoning": "It rolls there.", "answer": "A"})
 OPTIONS = read_choices("", ["Yes", "No", "Not sure"])
@@ -123,7 +123,7 @@ def asked_with_frames(mllm: MllmServer, data_dir: Path, images: int = 5) -> tupl
     )
     model = configure(settings)
     pixels = np.ascontiguousarray(ball(floor(320, 240), (160, 120), 30, (200, 40, 40)))
-    asked = ReaderInput(scene=Scene(pixels), question="Will it hit the mug?", seed=3)
+    asked = ReaderInput(pixels, "Will it hit the mug?", look(pixels), seed=3)
     (call,) = answer_calls(asked.question, OPTIONS, (encode(pixels, model.family).jpeg,) * images, None, 1, 100)
     client, before = MllmClient(model, settings), len(mllm.asked)
     try:

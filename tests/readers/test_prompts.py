@@ -10,12 +10,12 @@ import pytest
 from drawn import floor
 from jinja2.exceptions import SecurityError
 
+from cow_service.perception.observation import look
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.options import read_choices
 from cow_service.readers.prompts import Prompt, load_prompt, parse_prompt
 from cow_service.records import Asked, Grounding, MetresPerPixel, Motion, Speed
 from cow_service.stages.motion import motion_sentence
-from cow_service.vision.scene import Scene
 from cow_service.weights.manifests import PROMPTS, load_families
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def calls(family: str, question: str = "Does it go 3 cm?") -> dict[str, PromptCa
     from cow_service.readers.mllm.identify import identify_call
     from cow_service.readers.mllm.locate import locate_call, scale_call
 
-    given = ReaderInput(Scene(floor(640, 480)), question)
+    given = ReaderInput(floor(640, 480), question, look(floor(640, 480)))
     image = EncodedImage(b"", CoordinateFrame(640, 480, (640, 480), load_families()[family].coordinates))
     made = (
         identify_call(given, image, 100),

@@ -10,11 +10,11 @@ from conftest import DATA, ROOT
 from drawn import ball, block, floor, jpeg
 from refusals import refused
 
+from cow_service.perception.observation import look
 from cow_service.readers.base import ReaderInput
 from cow_service.readers.embedded.english.questions import parse, rewordings
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Asked, InterventionRequest, ObjectRequest, Reading
-from cow_service.vision.scene import Scene
 
 
 def rows(table: str) -> list[tuple[str, ...]]:
@@ -85,12 +85,12 @@ def test_the_other_one_is_what_is_left_of_two() -> None:
 
 
 def test_what_is_not_read_is_refused_with_questions_that_are() -> None:
-    scene = Scene(jpeg(block(ball(floor(), (150, 200), 40, (200, 30, 30)), (430, 150, 520, 250), (50, 80, 200))))
+    scene = look(jpeg(block(ball(floor(), (150, 200), 40, (200, 30, 30)), (430, 150, 520, 250), (50, 80, 200))))
     question = "If the red ball waddles left, will the blue cube be thwarted?"
     assert parse(question).asked is None
     assert any("thwarted" in words for words in parse(question).unread)
     with refused("cannot-ground") as caught:
-        EmbeddedReader().read(ReaderInput(scene, "Can the red ball thwart the blue cube?"))
+        EmbeddedReader().read(ReaderInput(scene.image, "Can the red ball thwart the blue cube?", scene))
     assert "'can the red ball thwart the blue cube'" in caught.value.detail.lower()
     for like in rewordings(parse("Can the red ball thwart the blue cube?")):
         assert parse(like).asked is not None
@@ -98,15 +98,15 @@ def test_what_is_not_read_is_refused_with_questions_that_are() -> None:
 
 
 def test_what_is_given_is_not_parsed_for() -> None:
-    scene = Scene(jpeg(block(ball(floor(), (150, 200), 40, (200, 30, 30)), (430, 150, 520, 250), (50, 80, 200))))
+    scene = look(jpeg(block(ball(floor(), (150, 200), 40, (200, 30, 30)), (430, 150, 520, 250), (50, 80, 200))))
     gizmo = ObjectRequest(object="gizmo", bbox=(110, 160, 190, 240), shape="sphere")
     question = "The gizmo, does it flummox?"
     change = InterventionRequest(kind="remove", object="blue cube")
     said = Reading(objects=(gizmo,), asked=Asked(relation="touches"), interventions=(change,))
-    result = EmbeddedReader().read(ReaderInput(scene, question, given=said, motion_wanted=False))
+    result = EmbeddedReader().read(ReaderInput(scene.image, question, scene, given=said, motion_wanted=False))
     mover = result.reading.grounding
     assert mover is not None
     assert (mover.object, mover.bbox, mover.prior) == ("gizmo", gizmo.bbox, gizmo.prior)
     assert (result.warnings, mover.is_doubtful) == ((), False)
     with refused("cannot-ground"):
-        EmbeddedReader().read(ReaderInput(scene, question, given=Reading(objects=(gizmo,))))
+        EmbeddedReader().read(ReaderInput(scene.image, question, scene, given=Reading(objects=(gizmo,))))

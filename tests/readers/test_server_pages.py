@@ -23,11 +23,11 @@ from outcomes import YES, simulated
 from refusals import refused
 from waiting import TIME_LIMIT
 
+from cow_service.perception.observation import look
 from cow_service.readers.base import Imagined, ReaderInput
 from cow_service.readers.options import read_choices
 from cow_service.requests import AnswerRequest
 from cow_service.settings import Settings
-from cow_service.vision.scene import Scene
 
 PAGES = {path.stem: path.read_text() for path in sorted((ROOT / "docs" / "servers").glob("*.md"))}
 BLOCK = re.compile(r"^```\w+\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -35,7 +35,7 @@ QUESTION = "If the red ball moves to the right, will it hit the blue cube?"
 OPTIONS = read_choices("", ["Yes", "No", "Not sure"])
 LIMIT = 3  # calls that may be lost to learning
 PIXELS = np.ascontiguousarray(block(ball(floor(), (150, 200), 40, (210, 20, 20)), (430, 160, 510, 250), (50, 80, 200)))
-SCENE = Scene(PIXELS)  # what is seen in it is seen once
+SCENE = look(PIXELS)  # what is seen in it is seen once
 # Where a provider's own client looks for another address than the provider's.
 ADDRESSES = {"openai": "OPENAI_BASE_URL", "anthropic": "ANTHROPIC_BASE_URL", "google": "GOOGLE_GEMINI_BASE_URL"}
 
@@ -344,7 +344,7 @@ def test_a_question_is_answered_as_the_page_sets_it_up(
             reply_as(handler, json.dumps(replies.pop(0)), habit.as_reasoning)
 
     mllm.say(served)
-    given = ReaderInput(scene=SCENE, question=QUESTION)
+    given = ReaderInput(SCENE.image, QUESTION, SCENE)
     imagined = Imagined(simulated(YES), (PIXELS,) * 4)
     try:
         mover = reader.read(given).reading.grounding
@@ -400,7 +400,7 @@ def test_a_failure_is_told_in_the_words_of_the_page(
     reader = create(settings.model_copy(update={"mllm_budget": 0.5}))  # which is what repeats would take
     mllm.say(lambda handler: handler.send(status, body))
     with refused(code) as caught:
-        reader.read(ReaderInput(scene=SCENE, question=QUESTION))
+        reader.read(ReaderInput(SCENE.image, QUESTION, SCENE))
     reader.close()
     assert reason in caught.value.detail
     assert f"| `{code}`: {reason}" in PAGES[page]

@@ -17,14 +17,14 @@ from PIL import Image
 from refusals import refused
 from rendered_scenes import scene_rows
 
+from cow_service.media.masks import iou
 from cow_service.media.share import Told
+from cow_service.perception.classical.regions import REGION
+from cow_service.perception.observation import look
 from cow_service.records import Outcome, Simulation
 from cow_service.requests import AnswerRequest, SimulateRequest
 from cow_service.service import Service
 from cow_service.settings import Settings
-from cow_service.vision.masks import iou
-from cow_service.vision.regions import REGION
-from cow_service.vision.scene import Scene
 
 RED, BLUE = (210, 20, 20), (50, 80, 200)
 DRAWN = png_bytes(block(ball(floor(), (150, 200), 40, RED), (430, 160, 510, 250), BLUE))
@@ -157,7 +157,7 @@ def test_many_objects_stay_affordable(service: Service) -> None:
         cv2.circle(image, (x, y), 16, BLUE, -1)
     place = {"grounding": {"bbox": [24, 24, 56, 56]}, "motion": MOTION}
     assert len(run(service, png_bytes(image), "?", **place, video=False, num_frames=17).frames) == 4
-    assert len(Scene(image).regions) == REGION.most
+    assert len(look(image).things) == REGION.most
 
 
 def test_a_cluttered_image_says_that_it_knows_no_surroundings(service: Service) -> None:

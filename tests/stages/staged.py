@@ -9,6 +9,7 @@ import numpy as np
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import CutoutGenerator
 from cow_service.media.images import decode_own
+from cow_service.media.types import Image
 from cow_service.records import Clip, Trajectory
 from cow_service.stages.generation import generate
 from cow_service.stages.grounding import ground
@@ -16,7 +17,6 @@ from cow_service.stages.keys import StageResult
 from cow_service.stages.motion import settle_motion
 from cow_service.stages.run import Run
 from cow_service.stages.trajectory import compute_trajectory
-from cow_service.vision.types import Image
 
 RED, BLUE, GREEN, YELLOW = (200, 30, 30), (40, 60, 200), (40, 160, 60), (210, 190, 40)
 

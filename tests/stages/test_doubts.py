@@ -14,7 +14,7 @@ from runs import run_of
 
 from cow_service.physics.ensemble import EnsembleResult, run_ensemble
 from cow_service.records import Doubt, Grounding, LocatedObject, Motion, Outcome
-from cow_service.stages.grounding import ground
+from cow_service.stages.grounding import ground, look_again
 from cow_service.stages.motion import settle_motion
 from cow_service.stages.reconstruction import reconstruct
 from cow_service.stages.seeing import Situation, see
@@ -36,7 +36,7 @@ def situation() -> tuple[Situation, EnsembleResult]:
         asked={"relation": "touches", "target": "blue block"},
     )
     grounding = ground(run).value
-    found = see(run, run.scene_of(grounding), grounding, settle_motion(run, grounding, None).value)
+    found = see(run, look_again(run, grounding), grounding, settle_motion(run, grounding, None).value)
     world, query, _ = reconstruct(found)
     (result,) = run_ensemble(world, query, 15)
     return found, result

@@ -45,7 +45,7 @@ def read(reading: MotionRequest | None, **given_: Any) -> StageResult[Motion]:
 
 def moved(reading: MotionRequest | None = None, **given_: Any) -> Trajectory:
     run_, found = run_with(reading, given_), read(reading, **given_).value
-    situation = see(run_, run_.scene, GROUNDING, found)
+    situation = see(run_, run_.sight.look(), GROUNDING, found)
     return simulate_world(situation, *reconstruct(situation))
 
 

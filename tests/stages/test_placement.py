@@ -15,6 +15,7 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout import CutoutGenerator, CutoutOptions
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Asked, Grounding, Intervention, LocatedObject, Placement, Trajectory
+from cow_service.stages.generation import scene_of
 from cow_service.stages.grounding import understood
 from cow_service.stages.motion import settle_motion
 from cow_service.stages.seeing import obstacles_of
@@ -85,11 +86,13 @@ class TestInto:
         touched = next(each for each in trajectory.encounters if each.kind == "touches")
         assert touched.first_frame >= 15, "nothing is touched while it is carried"
         assert put(with_bowl(SMALL), "into", BLUE_BOWL)[3] == trajectory, "the same each time"
-        obstacles, _ = obstacles_of(run.scene, grounding)
-        given = GeneratorInput(run.scene, grounding, motion, trajectory, obstacles, 0, CutoutOptions())
+        seen = run.sight.look()
+        obstacles, _ = obstacles_of(seen, grounding)
+        scene = scene_of(seen, grounding, trajectory)
+        given = GeneratorInput(scene, grounding, motion, trajectory, obstacles, 0, CutoutOptions())
         carried, last = CutoutGenerator().render(given, [8, FRAMES - 1], lambda done: None)
         assert is_red(last[int(y) - 8, int(x)])
-        front = run.scene.image[285, 380:460].astype(int)  # the wall below the nearer rim
+        front = scene.image[285, 380:460].astype(int)  # the wall below the nearer rim
         assert np.abs(last[285, 380:460].astype(int) - front).max() < 12
         assert not is_red(last[290, 150]), "it is gone from its place"
         over_x, over_y = trajectory.path.points[8]

@@ -13,15 +13,15 @@ from runs import run_of
 from staged import BLUE, GREEN, RED, YELLOW, VideoModel, clip_of, computed, pixels
 
 from cow_service.generators.cutout import create
+from cow_service.media.types import Image
 from cow_service.physics.ensemble import run_ensemble
 from cow_service.settings import Settings
-from cow_service.stages.grounding import ground
+from cow_service.stages.grounding import ground, look_again
 from cow_service.stages.motion import settle_motion
 from cow_service.stages.reconstruction import reconstruct
 from cow_service.stages.run import Run
 from cow_service.stages.seeing import see
 from cow_service.stages.trajectory import judge
-from cow_service.vision.types import Image
 
 MOVER, GOAL, BETWEEN = (80, 210, 130, 260), (480, 196, 550, 274), (280, 200, 350, 272)
 THERE = slice(BETWEEN[1] - 8, BETWEEN[3] + 8), slice(BETWEEN[0] - 8, BETWEEN[2] + 8)
@@ -89,7 +89,7 @@ def test_what_is_not_seen_clearly_makes_that_candidate_unsure_and_the_whole() ->
     asked = {"form": "which", "relation": "touches", "among": ("cube", "green block")}
     wanted = run(interventions=(), asked=asked, camera={"pitch": 28, "focal": 640}, objects_complete=True)
     grounding = ground(wanted).value
-    situation = see(wanted, wanted.scene_of(grounding), grounding, settle_motion(wanted, grounding, None).value)
+    situation = see(wanted, look_again(wanted, grounding), grounding, settle_motion(wanted, grounding, None).value)
     world, query, _ = reconstruct(situation)
     (result,) = run_ensemble(world, query, 15)
     for blurred, sure in ((None, [True, True]), (GOAL, [False, True]), (MOVER, [False, False])):
@@ -160,4 +160,4 @@ class TestFrames:
         first = model.given[0].scene
         assert off_bare(first.clean) < 5
         assert off_bare(first.image) < 5
-        assert first.silhouette(MOVER).any()
+        assert first.mover.full().any()

@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 from runs import run_of
 
 from cow_service.errors import CowError, MllmBadReply
+from cow_service.media.masks import CroppedMask
+from cow_service.perception.base import Thing
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
 from cow_service.readers.base import ReaderInput, ReadResult, WordsReading
 from cow_service.readers.embedded.reader import EmbeddedReader
@@ -41,8 +43,6 @@ from cow_service.stages.settling import (
     settle_question,
     settle_way,
 )
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.regions import Region
 
 RIGHT, LEFT, DOWN = (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0)
 MOVER = (100.0, 100.0, 140.0, 140.0)
@@ -194,12 +194,12 @@ def test_the_words_decide_what_they_say(
     assert (settled.asked, settled.question_is_doubtful, bool(objections)) == (asked, is_doubtful, is_doubtful)
 
 
-def seen(bbox: BBox, colour: str) -> Region:
+def seen(bbox: BBox, colour: str) -> Thing:
     """A block of one colour."""
     x0, y0, x1, y1 = map(int, bbox)
     mask = np.zeros((400, 600), bool)
     mask[y0:y1, x0:x1] = True
-    return Region(CroppedMask.of(mask), colour, frozenset((colour,)), 0.8, 1.0, is_disc=False)
+    return Thing(CroppedMask.of(mask), colour, frozenset((colour,)), 0.8, 1.0, is_disc=False)
 
 
 RED, BLUE = (100.0, 100.0, 140.0, 140.0), (300.0, 100.0, 380.0, 180.0)

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from refusals import refused
 from runs import run_of
 
+from cow_service.perception.observation import Observation, look
 from cow_service.readers.base import ReadResult
 from cow_service.records import (
     Asked,
@@ -32,31 +33,30 @@ from cow_service.stages.generation import choose_frames
 from cow_service.stages.grounding import ground
 from cow_service.stages.keys import StageResult
 from cow_service.stages.motion import settle_motion
-from cow_service.vision.scene import Scene
 
 POINT = {"point": (200, 200)}
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    return Scene(ball(floor(640, 400), (200, 200), 40, (200, 30, 30)))
+def scene() -> Observation:
+    return look(ball(floor(640, 400), (200, 200), 40, (200, 30, 30)))
 
 
-def run(scene: Scene, **request):
+def run(scene: Observation, **request):
     return run_of(scene.image, **request)
 
 
 @cache
-def grounded(scene: Scene, **place) -> Grounding:
+def grounded(scene: Observation, **place) -> Grounding:
     return ground(run(scene, grounding=place)).value
 
 
-def moved(scene: Scene, path: TrajectoryRequest | None = None, **motion) -> Motion:
+def moved(scene: Observation, path: TrajectoryRequest | None = None, **motion) -> Motion:
     given = ({"motion": motion} if motion else {}) | ({} if path is None else {"trajectory": path})
     return settle_motion(run(scene, **given), grounded(scene, **POINT), None).value
 
 
-def test_a_point_grounds_the_object_under_it_and_a_box_is_clipped_to_the_image(scene: Scene) -> None:
+def test_a_point_grounds_the_object_under_it_and_a_box_is_clipped_to_the_image(scene: Observation) -> None:
     grounding = grounded(scene, point=(220, 190))
     assert grounding.bbox == pytest.approx((160, 160, 240, 240), abs=4)
     assert grounding.point == pytest.approx((200, 200), abs=3)
@@ -72,12 +72,12 @@ def test_a_point_grounds_the_object_under_it_and_a_box_is_clipped_to_the_image(s
     [{"bbox": (-900, -900, 9000, 9000)}, {"bbox": (638.5, 10, 800, 90)}, {"point": (640, 10)}, {"point": (10, 400)}],
     ids=["all of the image", "a box outside", "beside it", "below it"],
 )
-def test_a_place_all_over_the_image_or_outside_is_refused(scene: Scene, given) -> None:
+def test_a_place_all_over_the_image_or_outside_is_refused(scene: Observation, given) -> None:
     with refused("invalid-request", f"/grounding/{next(iter(given))}"):
         grounded(scene, **given)
 
 
-def test_defaults_of_speed_scale_and_gravity(scene: Scene) -> None:
+def test_defaults_of_speed_scale_and_gravity(scene: Observation) -> None:
     linear = moved(scene, direction=(3, 4))
     assert linear.direction == pytest.approx((0.6, 0.8))
     assert linear.speed == pytest.approx(0.26 * 640)
@@ -92,7 +92,7 @@ def test_defaults_of_speed_scale_and_gravity(scene: Scene) -> None:
     assert fall.metres_per_pixel.source == "request"
 
 
-def test_a_given_path_is_a_motion(scene: Scene) -> None:
+def test_a_given_path_is_a_motion(scene: Observation) -> None:
     path = TrajectoryRequest(points=((200, 200), (300, 200), (300, 300)), fps=2)
     motion = moved(scene, path=path)
     assert (motion.kind, motion.speed) == ("linear", pytest.approx(200))
@@ -194,7 +194,7 @@ def test_the_law_alone_leaves_the_motion_to_the_reader() -> None:
     assert (default.law, default.ensemble) == ("contact", 50)
 
 
-def test_a_throw_without_a_speed_reaches_as_far_as_a_toy_does(scene: Scene) -> None:
+def test_a_throw_without_a_speed_reaches_as_far_as_a_toy_does(scene: Observation) -> None:
     thrown = moved(scene, direction=(1, 0), kind="projectile")
     x0, y0, x1, y1 = grounded(scene, **POINT).bbox
     radius, gravity = (x1 - x0 + y1 - y0) / 4, thrown.gravity[1]
@@ -207,7 +207,7 @@ def test_a_throw_without_a_speed_reaches_as_far_as_a_toy_does(scene: Scene) -> N
     assert (given.speed, given.speed_deviation, given.depth_deviation) == (50, 0, 4)
 
 
-def read_as(scene: Scene, reading: MotionRequest, **request) -> Motion:
+def read_as(scene: Observation, reading: MotionRequest, **request) -> Motion:
     class OneReader:
         source = "mllm"
 
@@ -219,7 +219,7 @@ def read_as(scene: Scene, reading: MotionRequest, **request) -> Motion:
     return settle_motion(run(scene, reader=OneReader, **request), grounded(scene, **POINT), None).value
 
 
-def test_what_a_reader_leaves_open_of_a_motion(scene: Scene) -> None:
+def test_what_a_reader_leaves_open_of_a_motion(scene: Observation) -> None:
     slow = read_as(scene, MotionRequest(kind="linear", direction=(1, 0), cue="text", speed="slow"))
     assert (slow.speed, slow.speed_deviation) == (pytest.approx(0.13 * 640), 0.25)
     thrown = read_as(scene, MotionRequest(kind="projectile", direction=(1, 0), cue="text", down=(0.6, 0.8)))
@@ -233,7 +233,7 @@ def test_what_a_reader_leaves_open_of_a_motion(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(("given", "language"), [({}, "es"), ({"language": "en"}, "en")])
-def test_the_questions_language_counts_where_the_request_names_none(scene: Scene, given, language: str) -> None:
+def test_the_questions_language_counts_where_the_request_names_none(scene: Observation, given, language: str) -> None:
     asked = run(scene, **given)
     assert asked.language == "en"
     asked.results["grounding"] = StageResult(value=grounded(scene, **POINT).model_copy(update={"language": "es"}))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,14 +13,14 @@ from hypothesis import strategies as st
 from runs import run_of
 from staged import BLUE, RED, computed
 
+from cow_service.media.masks import CroppedMask
+from cow_service.media.types import Image
+from cow_service.perception.observation import look
 from cow_service.records import Grounding, LocatedObject, ObjectPrior, Trajectory
 from cow_service.stages.motion import settle_motion
 from cow_service.stages.reconstruction import reconstruct
 from cow_service.stages.seeing import see
 from cow_service.stages.trajectory import simulate_world
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.scene import Scene
-from cow_service.vision.types import Image
 
 MOVER = {"object": "red ball", "bbox": (80, 210, 130, 260)}
 BEFORE, BESIDE, BEHIND = (300, 270, 370, 350), (330, 190, 400, 268), (330, 150, 380, 200)
@@ -159,7 +158,7 @@ def masked(bbox: tuple[float, float, float, float]) -> CroppedMask:
     return CroppedMask.of(mask)
 
 
-SEEN = Scene(scene(BESIDE, BEHIND))
+SEEN = look(scene(BESIDE, BEHIND))
 
 
 def seen(mover, others, prior: ObjectPrior | None = None, **request: Any) -> Trajectory:
@@ -179,9 +178,8 @@ def seen(mover, others, prior: ObjectPrior | None = None, **request: Any) -> Tra
         objects_complete=True,
         source="request",
     )
-    for box in (mover, *others):
-        SEEN.preset_mask(box, partial(lambda box: masked(box).full(), box))
-    situation = see(run, SEEN, grounding, settle_motion(run, grounding, None).value)
+    seen = SEEN.with_masks({box: masked(box) for box in (mover, *others)})
+    situation = see(run, seen, grounding, settle_motion(run, grounding, None).value)
     return simulate_world(situation, *reconstruct(situation))
 
 

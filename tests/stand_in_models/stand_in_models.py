@@ -11,10 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from cow_service.media.masks import bbox_of, iou
+from cow_service.media.types import Image, Mask
 from cow_service.perception.base import Detection, Prompt, Segment
-from cow_service.vision.masks import bbox_of, iou
-from cow_service.vision.regions import find_regions
-from cow_service.vision.types import Image, Mask
+from cow_service.perception.classical.regions import find_regions
 
 LEAST = 30  # px of a thing
 OFF_FLOOR, OTHER_FACE = 40, 12  # grey levels: of a thing beside the floor, of a face beside the next one

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 
 from cow_service.generators.base import GeneratorInput
+from cow_service.media.masks import eroded, hull, resized_mask, turning, window_of
+from cow_service.media.types import Floats, Floats32, Image, Mask
+from cow_service.perception.classical.inpainting import push_pull
 from cow_service.physics.camera import NEAREST, FloorCamera
 from cow_service.physics.tracks import TOUCHING, is_in_front
 from cow_service.records import FALLING_KINDS, BBox, Body, Path, Shape
-from cow_service.vision.inpainting import push_pull
-from cow_service.vision.masks import eroded, hull, resized_mask, turning, window_of
-from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 EDGE_SIGMA = 0.5  # px: Gaussian that softens the sprite's edge; moving it blurs it further
 MARGIN = 4  # px around the mask that the soft edge takes
@@ -286,7 +286,7 @@ def moving_bodies(given: GeneratorInput, size: tuple[int, int], ground: Ground |
     found: list[MovingBody] = []
     for path in given.trajectory.paths:
         if path.body == 0:
-            bbox, mask = given.grounding.bbox, given.scene.silhouette(given.grounding.bbox)
+            bbox, mask = given.grounding.bbox, given.scene.mover.full()
         else:
             obstacle = given.obstacles[path.body - 1]
             bbox, mask = obstacle.bbox, obstacle.mask.full()

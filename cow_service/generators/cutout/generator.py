@@ -13,11 +13,11 @@ from cow_service import __version__
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.bodies import MovingBody, Sprite, StillBody, Window
 from cow_service.generators.cutout.layers import MAX_SIDE, CutoutOptions, Layers, take_apart
+from cow_service.media.masks import scaled_size, three_channels
+from cow_service.media.types import Floats32, Image, Mask
 from cow_service.physics.ballistic import has_passed
 from cow_service.records import GeneratorInfo
 from cow_service.settings import Settings
-from cow_service.vision.masks import scaled_size, three_channels
-from cow_service.vision.types import Floats32, Image, Mask
 
 
 class CutoutGenerator:

@@ -13,10 +13,10 @@ from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.bodies import Ground, MovingBody, Sprite, StillBody, moving_bodies, still_bodies
 from cow_service.generators.cutout.shadows import MovingShadow, UnshadedScene, take_shadows
 from cow_service.media.images import fit_within
-from cow_service.vision.inpainting import blend_fill, fill_hole, shadow_beside
-from cow_service.vision.masks import CroppedMask, hull, iou, resized_mask, window_of
-from cow_service.vision.openings import measure_opening
-from cow_service.vision.types import Image, Mask
+from cow_service.media.masks import CroppedMask, hull, iou, resized_mask, window_of
+from cow_service.media.types import Image, Mask
+from cow_service.perception.classical.inpainting import blend_fill, fill_hole, shadow_beside
+from cow_service.perception.classical.openings import measure_opening
 
 MAX_SIDE = 1280  # px: longer images give a clip of this size
 HOLE_GROWTH = 0.03  # of the object's size: the rim, mixed with the background, is inpainted too
@@ -88,7 +88,7 @@ def take_apart(given: GeneratorInput, progress: Callable[[float], None] = lambda
     eye = 0.0 if ground is None else ground.camera.height
     moving = moving_bodies(given, size, ground)
     still = still_bodies(given, moving, size, ground)
-    if scene.side_view is None:
+    if scene.backdrop is None:
         unshaded = take_shadows(given, image, moving, still, ground, factor)
         cues = resized_mask(scene.cues, size) if clean else None
         fill = None if given.inpainter is None else partial(given.inpainter.fill, progress=progress)
@@ -97,7 +97,7 @@ def take_apart(given: GeneratorInput, progress: Callable[[float], None] = lambda
         unshaded, background = UnshadedScene(image, {}, frozenset(), ()), image.copy()
         holes = np.logical_or.reduce([_dilated(body.mask, DRAWN_RIM) for body in moving])
         holes &= ~np.logical_or.reduce([np.zeros_like(holes), *(body.mask for body in still)])
-        background[holes] = fit_within(scene.side_view.empty, MAX_SIDE)[holes]
+        background[holes] = fit_within(scene.backdrop, MAX_SIDE)[holes]
     sprites: list[Sprite] = []
     for body in moving:
         hidden = hidden_part(body, moving, still, eye)

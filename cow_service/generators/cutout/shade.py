@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 
 from cow_service.generators.cutout.bodies import Window, warping
+from cow_service.media.masks import dilated, window_of
+from cow_service.media.types import Floats, Floats32, Image, Mask
+from cow_service.perception.classical.inpainting import push_pull, quadratic_terms
 from cow_service.records import BBox
-from cow_service.vision.inpainting import push_pull, quadratic_terms
-from cow_service.vision.masks import dilated, window_of
-from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 WORKING_SIDE = 40.0  # px: the surroundings are measured at the size at which the object's longer side is so long
 SIDEWAYS, DOWN, UP = 1.0, 0.7, 0.2  # of the object's longer side: how far around its box a shadow is looked for

@@ -15,10 +15,9 @@ import numpy as np
 from cow_service.generators.base import GeneratorInput
 from cow_service.generators.cutout.bodies import Ground, MovingBody, StillBody, Surface, Window, clipped
 from cow_service.generators.cutout.shade import LEAST_SHADE, Shade, cast_shade, contact_shade, strongest
+from cow_service.media.masks import bbox_of, eroded, three_channels
+from cow_service.media.types import Floats, Floats32, Image, Mask
 from cow_service.records import Path, Vector
-from cow_service.vision.masks import bbox_of, eroded, three_channels
-from cow_service.vision.shadows import find_shadow
-from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 FADED = 0.6  # of its height: a standing thing that has risen so far has no contact shadow any more
 SKY, SHARPNESS = 1.5, 2.0  # the part of that share that is lost: light also comes in from the side
@@ -214,7 +213,7 @@ def _light_through(given: GeneratorInput, body: MovingBody, ground: Ground) -> V
     """The light (m right and ahead per m of height): as it is known, or as a shadow is found below the mover."""
     first, light = np.array(body.path.states[0][:3]), given.trajectory.light
     if light is None and body.path.body == 0:
-        found, high = find_shadow(given.scene, given.grounding.bbox), ground.height(first)
+        found, high = given.scene.shadow, ground.height(first)
         there = None if found is None else ground.camera.floor_points(np.array([found.centre]))
         if there is not None and np.isfinite(there).all() and high > 0:
             gap = ground.camera.to_floor(there)[0] - ground.camera.to_floor(first[None])[0]

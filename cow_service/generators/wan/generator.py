@@ -27,11 +27,11 @@ from cow_service.generators.wan import pipeline as wan
 from cow_service.generators.wan.conditioning import CELL, TrackConditioning
 from cow_service.generators.wan.profiles import Profile, Sampling, WanLimits, WanOptions
 from cow_service.generators.wan.tracks import STRIDE, Tracks, clip_length, tracks_of
+from cow_service.media.types import Image, Mask
 from cow_service.narration.story import shown
 from cow_service.physics.tracks import Density, at_rate, with_tracks
 from cow_service.records import GeneratorInfo
 from cow_service.settings import Settings
-from cow_service.vision.types import Image, Mask
 from cow_service.weights.device import cpu_threads
 from cow_service.weights.manifests import Manifest
 
@@ -202,8 +202,7 @@ class WanGenerator(WanLimits):
         spacing, least, most = (self.manifest.defaults[f"track_{name}"] for name in ("spacing", "least", "most"))
         scene, trajectory = given.scene, given.trajectory
         if not trajectory.tracks_given:
-            mover = scene.cropped(given.grounding.bbox)
-            masks = [mover, *(each.mask for each in given.obstacles)]
+            masks = [scene.mover, *(each.mask for each in given.obstacles)]
             density = Density(float(spacing) * scene.width / width, int(least), int(most))
             trajectory = with_tracks(trajectory, masks, given.grounding.point, density)
         # The sides of a clip are rounded, so that its aspect ratio is not quite the image's.

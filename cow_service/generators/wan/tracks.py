@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cow_service.errors import InvalidRequest, install_line
+from cow_service.media.types import Floats, Floats32
 from cow_service.records import Trajectory
-from cow_service.vision.types import Floats, Floats32
 
 MAX_FRAMES = 81  # of a Wan2.1 clip
 CLIP_FPS = 16.0  # at which Wan2.1 was trained

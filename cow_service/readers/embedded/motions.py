@@ -8,6 +8,9 @@ from pydantic import ValidationError
 
 from cow_service import records
 from cow_service.errors import CannotGround, CannotReadDirection
+from cow_service.media.masks import is_same_object
+from cow_service.perception.classical.trails import trail_of
+from cow_service.perception.observation import Observation
 from cow_service.physics.camera import depth_motion, way_to
 from cow_service.readers.base import GIVE_DIRECTION, GIVE_PLACE
 from cow_service.readers.embedded.english.lexicon import ObjectPhrase, QuantityWords
@@ -15,9 +18,6 @@ from cow_service.readers.embedded.english.noun_phrases import kind_of, prior_of
 from cow_service.readers.embedded.english.questions import MotionWords, Question
 from cow_service.readers.embedded.matching import best_matches, match_one, unclear
 from cow_service.records import DIRECTED_KINDS, BBox, MotionKind, MotionRequest, ObjectRequest, Vector
-from cow_service.vision.masks import is_same_object
-from cow_service.vision.scene import Scene
-from cow_service.vision.trails import trail_of
 
 NEARER = 0.75  # of the distance of the other end of a trail to what tells its last position: else neither is it
 _ON_FLOOR = frozenset({"slide", "roll", "drive", "glide", "skid"})  # such an object keeps touching its support
@@ -92,7 +92,7 @@ def steps_of(steps: Sequence[MotionWords], bbox: BBox) -> tuple[records.MotionSt
 
 
 def others_of(
-    others: Sequence[tuple[ObjectPhrase, MotionWords]], scene: Scene, things: Sequence[ObjectRequest]
+    others: Sequence[tuple[ObjectPhrase, MotionWords]], observation: Observation, things: Sequence[ObjectRequest]
 ) -> tuple[records.OtherMotionRequest, ...]:
     """What else is set moving. Raises `CannotReadDirection` if it was not found, or which way is not said."""
     readings: list[records.OtherMotionRequest] = []
@@ -100,7 +100,7 @@ def others_of(
         found = next((each for each in things if each.object == phrase.text), None)
         if found is None or motion.steps or any(each.what != "speed" for each in motion.quantities):
             raise _refused(f"'{phrase.text}' moves, too, and was not found, or how far it moves is said.")
-        refuse_unclear_fall(scene, motion, found)
+        refuse_unclear_fall(observation, motion, found)
         kind, said = motion.kind or "linear", dict[str, Any]()
         if kind in DIRECTED_KINDS:
             goal = None if motion.direction or motion.towards is None else motion.towards.text
@@ -110,34 +110,36 @@ def others_of(
     return tuple(readings)
 
 
-def refuse_unclear_fall(scene: Scene, words: MotionWords, thing: records.GroundingRequest | ObjectRequest) -> None:
+def refuse_unclear_fall(
+    observation: Observation, words: MotionWords, thing: records.GroundingRequest | ObjectRequest
+) -> None:
     """Raises `CannotReadDirection` for what falls over where it stands, and for a fall of what may stand."""
     name = thing.object or ""
-    region = None if thing.bbox is None else scene.region_of(thing.bbox)
+    found = None if thing.bbox is None else observation.thing_in(thing.bbox)
     # The shadow of a ball tells how high it is.
-    is_ball = prior_of(name).shape == "sphere" or (region is not None and region.is_disc)
-    in_air = words.in_air or is_ball or scene.side_view is not None or thing.stands_on == "air"
+    is_ball = prior_of(name).shape == "sphere" or (found is not None and found.is_disc)
+    in_air = words.in_air or is_ball or observation.side_view is not None or thing.stands_on == "air"
     if words.topples and not is_ball:
         raise _refused(f"The {name} would fall over where it stands, which is not simulated. Ask what a push does.")
     if words.kind == "fall" and not in_air:
         raise _refused(f"Whether the {name} stands or hangs cannot be seen. If it hangs, say that it is dropped.")
 
 
-def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, ...]]:
-    """The scene in which the trail that the question may be about ends where the question says, and a warning.
+def with_trail_as_said(observation: Observation, question: Question) -> tuple[Observation, tuple[str, ...]]:
+    """What is seen where the trail that the question may be about ends where it says, and a warning.
 
     If neither the image nor the words show the end, it is the one whose path leads on to the object in question.
     Raises `CannotGround` if the thing that the words tell the end by was not found.
     """
     end, phrase = question.motion.trail_end, question.mover
-    if phrase is None or phrase.is_given or not scene.trails:
-        return scene, ()
-    found = (trail_of(scene.trails, region.bbox) for region in best_matches(scene.regions, phrase))
+    if phrase is None or phrase.is_given or not observation.trails:
+        return observation, ()
+    found = (trail_of(observation.trails, thing.bbox) for thing in best_matches(observation.things, phrase))
     trails = [trail for trail in found if trail is not None]
     if len(trails) != 1:
-        return scene, ()
+        return observation, ()
     trail, warnings = trails[0], ()
-    beside = [region for region in scene.regions if trail_of((trail,), region.bbox) is None]
+    beside = [thing for thing in observation.things if trail_of((trail,), thing.bbox) is None]
     if isinstance(end, ObjectPhrase):
         near = match_one(beside, end)
         gaps = sorted(math.dist(trail.positions[at].centre, near.centre) for at in (0, -1)) if near else []
@@ -150,8 +152,8 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
     if not trail.end_known:
         # What may lie ahead: the first thing that is asked about, else the middle of the image.
         asked = ((each.text, match_one(beside, each)) for each in question.others)
-        x, y = scene.width / 2, scene.height / 2
-        ahead = ((name, region.bbox) for name, region in asked if region is not None)
+        x, y = observation.width / 2, observation.height / 2
+        ahead = ((name, thing.bbox) for name, thing in asked if thing is not None)
         name, bbox = next(ahead, ("middle of the image", (x, y, x, y)))
         trail = trail.ending(bbox)
         warnings = (
@@ -159,7 +161,7 @@ def scene_of_mover(scene: Scene, question: Question) -> tuple[Scene, tuple[str, 
             f"nor the question tell which is the last: the one nearest to the {name} was taken for it. Say otherwise "
             f'like "on along its trail, the last of which is the leftmost". {GIVE_PLACE}',
         )
-    return scene.with_mover(trail.present.bbox), warnings
+    return observation.with_mover(trail.present.bbox), warnings
 
 
 def said_way(words: MotionWords, kind: MotionKind) -> dict[str, object]:
@@ -184,7 +186,7 @@ def said_way(words: MotionWords, kind: MotionKind) -> dict[str, object]:
 
 
 def read_motion(
-    question: Question, scene: Scene, mover: records.GroundingRequest, things: Sequence[ObjectRequest]
+    question: Question, observation: Observation, mover: records.GroundingRequest, things: Sequence[ObjectRequest]
 ) -> MotionRequest:
     """How the mover moves by the words, without the image's say in which way. Raises `CannotReadDirection`."""
     words, name, bbox = question.motion, mover.object, mover.bbox or (0.0, 0.0, 0.0, 0.0)
@@ -194,8 +196,8 @@ def read_motion(
         raise _refused(f"How the {name} moves was not understood: '{unread}'.")
     if words.is_contradictory or (kind == "static" and question.names_direction):
         raise _refused(f"What the question says of the motion of the {name} contradicts itself.")
-    refuse_unclear_fall(scene, words, mover)
-    if kind in DIRECTED_KINDS and scene.side_view is not None:
+    refuse_unclear_fall(observation, words, mover)
+    if kind in DIRECTED_KINDS and observation.side_view is not None:
         if words.direction == (0.0, 1.0) and kind == "linear":
             kind = "fall"  # down a slope, or over an edge, by its weight
         elif words.depth:
@@ -206,7 +208,7 @@ def read_motion(
     if kind in DIRECTED_KINDS and not way and question.names_direction:
         unread = "', '".join(question.unread)
         raise _refused(f"Which way the {name} moves was not understood: '{unread}'.")
-    goal = goal_of(scene, words.towards, mover, things) if "towards" in way and words.towards else None
+    goal = goal_of(observation, words.towards, mover, things) if "towards" in way and words.towards else None
     ahead = None if goal is None else way_to(goal, bbox, kind == "linear")
     if ahead is not None and all(each.object != way["towards"] for each in things):  # only here it is known where
         way |= {"direction": ahead, "cue": "text"}
@@ -214,7 +216,11 @@ def read_motion(
     try:
         speed, distance, duration, until = quantities(words.quantities, far, bbox)
         said = {"speed": speed if kind in DIRECTED_KINDS else None, "distance": distance, "duration": duration}
-        said |= {"until": until, "steps": steps_of(words.steps, bbox), "others": others_of(words.others, scene, things)}
+        said |= {
+            "until": until,
+            "steps": steps_of(words.steps, bbox),
+            "others": others_of(words.others, observation, things),
+        }
         return MotionRequest.model_validate({"kind": kind, **way, **{k: v for k, v in said.items() if v}})
     except ValidationError as error:
         fault = error.errors()[0]
@@ -222,14 +228,14 @@ def read_motion(
 
 
 def goal_of(
-    scene: Scene, phrase: ObjectPhrase, mover: records.GroundingRequest, things: Sequence[ObjectRequest]
+    observation: Observation, phrase: ObjectPhrase, mover: records.GroundingRequest, things: Sequence[ObjectRequest]
 ) -> BBox:
     """The box of the thing that the mover moves towards. Raises `CannotReadDirection`."""
     goal = next((each.bbox for each in things if each.object == phrase.text), None)
-    besides = [each for each in scene.regions if not is_same_object(each.bbox, mover.bbox or each.bbox)]
-    region = match_one(besides, phrase)
+    besides = [each for each in observation.things if not is_same_object(each.bbox, mover.bbox or each.bbox)]
+    thing = match_one(besides, phrase)
     if goal is not None:
         return goal
-    if region is None:
+    if thing is None:
         raise _refused(f"Where the {mover.object} moves to is not clear: {unclear(phrase, besides)}.")
-    return region.bbox
+    return thing.bbox

@@ -5,7 +5,10 @@ from dataclasses import replace
 
 from cow_service import __version__, records
 from cow_service.errors import CannotGround
+from cow_service.media.masks import is_among, is_same_object
 from cow_service.narration.words import phrases_of, same_name
+from cow_service.perception.base import Thing
+from cow_service.perception.observation import Observation
 from cow_service.readers import base
 from cow_service.readers.base import GIVE_OBJECT, GIVE_PLACE
 from cow_service.readers.embedded import matching, motions
@@ -15,9 +18,6 @@ from cow_service.readers.embedded.english.lexicon import ObjectPhrase
 from cow_service.readers.embedded.english.questions import ChangeWords, Question, parse, rewordings
 from cow_service.readers.options import plain
 from cow_service.settings import Settings
-from cow_service.vision.masks import is_among, is_same_object
-from cow_service.vision.regions import Region
-from cow_service.vision.scene import Scene
 
 LOCATE_IT = f"{GIVE_PLACE} Or click it on the page, or have a multimodal LLM read the image (COW_MLLM)."
 
@@ -74,7 +74,7 @@ class EmbeddedReader:
         return found if found and kind.count in (None, len(found)) else (words,)
 
     def read(self, given: base.ReaderInput) -> base.ReadResult:
-        """The region that fits the mover's words, or what is given under them, and its motion in words.
+        """The thing that fits the mover's words, or what is given under them, and its motion in words.
 
         Raises `CannotGround`, `CannotReadDirection`.
         """
@@ -89,30 +89,30 @@ class EmbeddedReader:
             )
             raise CannotGround(f"{fault} Ask like: {like}", remedy=LOCATE_IT)
         with given.cpu():
-            scene, found = given.scene, base.ReadResult(records.Reading(grounding=place))
+            observation, found = given.seen, base.ReadResult(records.Reading(grounding=place))
             if not is_placed and mover is not None:
-                scene, found = self._located(given, question, mover)
+                observation, found = self._located(given, question, mover)
             if not is_open or found.reading.grounding is None:
                 return base.ReadResult() if is_placed else found
             things = (*given.known, *found.reading.objects)
-            motion = motions.read_motion(question, scene, found.reading.grounding, things)
+            motion = motions.read_motion(question, observation, found.reading.grounding, things)
         update = {"motion": motion} | ({"grounding": None} if is_placed else {})
         return replace(found, reading=found.reading.model_copy(update=update))
 
     def _located(
         self, given: base.ReaderInput, question: Question, mover: ObjectPhrase
-    ) -> tuple[Scene, base.ReadResult]:
-        """Where the things are, and what is changed and asked; in the scene in which its trails end as is said."""
+    ) -> tuple[Observation, base.ReadResult]:
+        """Where the things are, and what is changed and asked; with trails that end as is said."""
         changes = () if given.given.interventions else question.changes
         _check_changes(question, changes)
-        scene, warnings = motions.scene_of_mover(given.scene, question)
-        if given.find is not None and scene.side_view is None:
-            scene = matching.with_found(scene, given.find(matching.nouns_of(question, given.sought)))
-        finder = _Finder(scene, given.known)
+        observation, warnings = motions.with_trail_as_said(given.seen, question)
+        if given.find is not None and observation.side_view is None:
+            observation = observation.with_found(given.find(matching.nouns_of(question, given.sought)))
+        finder = _Finder(observation, given.known)
         bbox, changed = finder.changed(changes, mover, question.names_arrow)
         named, things, unclear = finder.others(question, given, bbox)
         is_told = given.given.asked is None or not given.given.interventions
-        doubts, doubtful = matching.noun_doubts(scene, [*named, *([] if mover.is_given else [(mover, bbox)])])
+        doubts, doubtful = matching.noun_doubts(observation, [*named, *([] if mover.is_given else [(mover, bbox)])])
         left = question.unread if is_told else ()
         own = finder.known.get(mover.text) or records.GroundingRequest()
         # A thing has one name: that under which it is asked about goes before that of a change.
@@ -144,7 +144,7 @@ class EmbeddedReader:
             asked=question.asked if given.given.asked is None else None,
         )
         told = (f"The words '{each}' were not understood, so no outcome is sure." for each in left)
-        return scene, base.ReadResult(reading, (*warnings, *(unclear if is_told else ()), *doubts, *told))
+        return observation, base.ReadResult(reading, (*warnings, *(unclear if is_told else ()), *doubts, *told))
 
     def answer(
         self,
@@ -209,31 +209,31 @@ def _check_changes(question: Question, changes: Sequence[ChangeWords]) -> None:
 class _Finder:
     """Finds the things of one question: what is given under their words first, then what is seen."""
 
-    def __init__(self, scene: Scene, known: Sequence[records.ObjectRequest]) -> None:
-        self.scene, self.regions = scene, tuple(scene.regions)
+    def __init__(self, observation: Observation, known: Sequence[records.ObjectRequest]) -> None:
+        self.observation, self.seen = observation, tuple(observation.things)
         self.known, self.taken = {each.object: each for each in known}, dict[str, records.BBox]()
         self._given = f" Given: {', '.join(self.known)}." if known else ""
 
-    def without(self, boxes: Sequence[records.BBox]) -> tuple[Region, ...]:
-        """The regions that are in none of some boxes."""
-        return tuple(region for region in self.regions if not is_among(region.bbox, boxes))
+    def without(self, boxes: Sequence[records.BBox]) -> tuple[Thing, ...]:
+        """The things that are in none of some boxes."""
+        return tuple(thing for thing in self.seen if not is_among(thing.bbox, boxes))
 
     def mover(self, phrase: ObjectPhrase, names_arrow: bool) -> records.BBox:
         """The box of what moves. Raises `CannotGround`."""
-        scene = self.scene
+        observation = self.observation
         if phrase.is_given:
             return self.known[phrase.text].bbox or (0.0, 0.0, 0.0, 0.0)
         if phrase.inside_box:
-            return matching.inside_drawn_box(scene, phrase)
-        fitting = matching.best_matches(self.regions, phrase)
+            return matching.inside_drawn_box(observation, phrase)
+        fitting = matching.best_matches(self.seen, phrase)
         if len(fitting) > 1 and (names_arrow or phrase.path_end == "start"):
-            fitting = scene.at_arrow(fitting) or fitting
+            fitting = observation.at_arrow(fitting) or fitting
         if len(fitting) == 1 and noun_phrases.kind_of(phrase.text) is None:
             return fitting[0].bbox
-        fault = f"What moves is not clear: {matching.unclear(phrase, scene.regions)}."
+        fault = f"What moves is not clear: {matching.unclear(phrase, observation.things)}."
         if noun_phrases.kind_of(phrase.text) is not None:
             fault = f"The question moves '{phrase.text}' at once: ask of one thing, or name each."
-        elif not scene.regions:
+        elif not observation.things:
             fault = f"Looked for '{phrase.text}', but no objects could be told apart in the image."
         raise CannotGround(fault + self._given, remedy=LOCATE_IT)
 
@@ -249,7 +249,7 @@ class _Finder:
             things = self._found(change.object, f"takes '{change.object.text}' away")
             changed += [(change, [thing]) for thing in things]
         gone = [thing.bbox for _, (thing,) in changed if thing.bbox is not None]
-        self.regions = self.without(gone)
+        self.seen = self.without(gone)
         bbox = self.mover(mover, names_arrow)
         self.taken = {mover.text: bbox}
         for change in (each for each in changes if each.kind == "place" and each.targets):
@@ -274,13 +274,13 @@ class _Finder:
         parsed = [(name, noun_phrases.parse_noun_phrase(name)) for name in sought]
         wanted = [*question.others, *(replace(phrase, text=name) for name, phrase in parsed if phrase is not None)]
         # An object outlined by models is separate, even if its box is nearly that of the mover in front of it.
-        apart = [each for each in self.regions if each.bbox != bbox]
+        apart = [each for each in self.seen if each.bbox != bbox]
         beside = [each for each in apart if each.called or not is_same_object(each.bbox, bbox)]
         alone = beside[0] if len(beside) == 1 else None
         fitting = [
             (each, alone if each.is_other else matching.match_one(beside, each)) for each in wanted if not each.is_given
         ]
-        of_kinds = matching.things_of_kinds(self.regions, question, bbox, given.known)
+        of_kinds = matching.things_of_kinds(self.seen, question, bbox, given.known)
         seen = [records.ObjectRequest(object=phrase.text, bbox=each.bbox) for phrase, each in fitting if each]
         unclear = [
             f"{matching.unclear(phrase, beside)}. No encounter is listed under that name."
@@ -300,8 +300,8 @@ class _Finder:
             kind = replace(kind, count=kind.count or count)
             things = matching.named_by_colour(matching.match_several(free, kind), kind, self.taken)
         else:
-            region = matching.match_one(free, phrase) if kind is None and taken is None else None
-            box = region.bbox if region is not None else taken
+            thing = matching.match_one(free, phrase) if kind is None and taken is None else None
+            box = thing.bbox if thing is not None else taken
             things = [records.ObjectRequest(object=phrase.text, bbox=box)] if box else []
         if not things:
             why = matching.unclear(phrase, free)

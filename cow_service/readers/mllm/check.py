@@ -9,7 +9,9 @@ from typing import Literal, TypeVar, cast
 
 from cow_service.errors import CowError, MllmUnavailable
 from cow_service.media.images import decode
+from cow_service.media.masks import iou
 from cow_service.narration.words import same_name
+from cow_service.perception.observation import look
 from cow_service.readers.base import CallLog, ReaderInput, ReadResult
 from cow_service.readers.mllm.answer import answer_calls
 from cow_service.readers.mllm.client import PARSER_BUGS, MllmClient, PromptCall
@@ -20,8 +22,6 @@ from cow_service.readers.mllm.known import USUAL
 from cow_service.readers.mllm.locate import locate_call, read_located
 from cow_service.readers.mllm.replies import ReplyError
 from cow_service.records import AnswerOption, BBox, Coordinates, MllmMeasurement, MotionRequest, Record, Usage, Vector
-from cow_service.vision.masks import iou
-from cow_service.vision.scene import Scene
 from cow_service.weights.manifests import EXAMPLES
 
 FOUND = 0.5  # intersection over union from which a box counts as that of the thing
@@ -109,7 +109,7 @@ def check_model(client: MllmClient, reasoning_length: int) -> MllmCheck:
     log, seconds, family = CallLog(), list[float](), client.family
     pictures = {name: decode(EXAMPLES[name].file("image").read_bytes()).pixels for name in QUESTIONS}
     images = {name: encode(pixels, family) for name, pixels in pictures.items()}
-    inputs = {name: ReaderInput(Scene(pixels), QUESTIONS[name], calls=log) for name, pixels in pictures.items()}
+    inputs = {name: ReaderInput(pixels, QUESTIONS[name], look(pixels), calls=log) for name, pixels in pictures.items()}
 
     def ask(name: str, call: PromptCall[T]) -> T | CowError:
         began = time.monotonic()

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any, Literal
 
 from cow_service import records
+from cow_service.media.masks import is_among, is_same_object
 from cow_service.narration.words import same_name
 from cow_service.physics.camera import depth_motion
 from cow_service.readers.base import ReaderInput, ReadResult
@@ -18,7 +19,6 @@ from cow_service.readers.mllm.client import PromptCall
 from cow_service.readers.mllm.coordinates import NUMBER, CoordinateFrame, EncodedImage
 from cow_service.readers.mllm.quantities import ReadingContext, positive
 from cow_service.readers.mllm.replies import ReplyError
-from cow_service.vision.masks import is_among, is_same_object
 
 BOX_KEYS = ("bbox_2d", "box_2d", "bbox", "box", "bounding_box", "boundingbox", "bbox2d")
 POINT_KEYS = ("point_2d", "point", "center", "centre", "point2d")

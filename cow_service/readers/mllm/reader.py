@@ -98,7 +98,7 @@ class MllmReader:
         `MllmUnavailable`.
         """
         with given.cpu():
-            image = encode(given.scene.image, self._client.family)
+            image = encode(given.image, self._client.family)
         place, motion = given.given.grounding, given.given.motion
         bbox = None if place is None else place.bbox
         known_kind = None if motion is None else motion.kind
@@ -188,7 +188,7 @@ class MllmReader:
     ) -> tuple[base.AnswerReading, ...]:
         """One call per vote, all at the same time. Raises `MllmBadReply`, `MllmUnavailable` if all of them fail."""
         with given.cpu():
-            pixels = (given.scene.image, *(() if imagined is None else pictures(imagined)))
+            pixels = (given.image, *(() if imagined is None else pictures(imagined)))
             jpegs = tuple(encode(each, self._client.family).jpeg for each in pixels)
         calls = answer_calls(given.question, options, jpegs, imagined, votes, self._reasoning)
         results = self._client.complete_all(calls, given)
@@ -200,7 +200,7 @@ class MllmReader:
     def _identify(self, given: ReaderInput, image: EncodedImage) -> Identified:
         """The question in words; of several arrows the MLLM says which one is meant."""
         with given.cpu():
-            said = identified_by_words(given) if given.words and len(given.scene.arrows) <= 1 else None
+            said = identified_by_words(given) if given.words and len(given.seen.arrows) <= 1 else None
         said = said or self._client.complete(identify_call(given, image, self._reasoning), given)
         return said or NOTHING_IDENTIFIED
 

@@ -8,8 +8,8 @@ from drawn import ball, floor
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.vision.completion import as_disc
-from cow_service.vision.inpainting import blend_fill, erase_drawing, fill_hole, push_pull, shadow_beside
+from cow_service.perception.classical.completion import as_disc
+from cow_service.perception.classical.inpainting import blend_fill, erase_drawing, fill_hole, push_pull, shadow_beside
 
 ROWS, COLUMNS = np.mgrid[:400, :640]
 

@@ -10,12 +10,11 @@ import pytest
 from conftest import DATA, example
 from drawn import Image, ball, block, bowl, floor, jpeg, trail
 
-from cow_service.vision.forms import log_ratio, looks_like
-from cow_service.vision.openings import measure_opening
-from cow_service.vision.scene import Scene
-from cow_service.vision.segmentation import mask_from_bbox, mask_from_point
-from cow_service.vision.shadows import find_shadow
-from cow_service.vision.side_view import pieces_of
+from cow_service.media.masks import pieces_of
+from cow_service.perception.classical.forms import log_ratio, looks_like
+from cow_service.perception.classical.openings import measure_opening
+from cow_service.perception.classical.segmentation import mask_from_bbox, mask_from_point
+from cow_service.perception.observation import Observation, look
 
 RED, BLUE, BROWN, WHITE = (200, 40, 40), (50, 80, 200), (139, 90, 43), (240, 240, 240)
 
@@ -69,10 +68,10 @@ PICTURES: dict[str, Callable[[], Image]] = {
 }
 
 
-def figures(scene: Scene) -> list[tuple]:
+def figures(scene: Observation) -> list[tuple]:
     """A row for whatever was measured: its name and numbers, in px and shares."""
     rows: list[tuple] = []
-    for region in scene.regions:
+    for region in scene.things:
         flags = region.is_disc, region.is_hidden, region.roundness, region.confidence, log_ratio(region, "vase")
         rows.append((f"{region.colour} {looks_like(region)}", *region.bbox, region.mask.area, *flags))
     rows += [("arrow", *arrow.tail, *arrow.tip, np.count_nonzero(arrow.mask), arrow.fit) for arrow in scene.arrows]
@@ -86,9 +85,9 @@ def figures(scene: Scene) -> list[tuple]:
         shapes = scene.side_view.shapes
         return rows + [("piece", *np.ptp(each, axis=0)) for shape in shapes for each in pieces_of(shape)]
     rows.append(("edges", np.hypot(*(scene.segments[:, :2] - scene.segments[:, 2:]).T).sum()))
-    if shadow := find_shadow(scene, scene.regions[-1].bbox):
+    if shadow := scene.shadow_below(scene.things[-1].bbox):
         rows.append(("shadow", *shadow.centre, *shadow.spread, shadow.shade))
-    for region in scene.regions[1:2]:
+    for region in scene.things[1:2]:
         opening, cut = measure_opening(region.mask), mask_from_bbox(scene.clean, region.bbox)
         rows.append(("opening", opening.inner, opening.bottom, opening.rim is not None))
         rows.append(("cut", np.count_nonzero(cut), np.count_nonzero(mask_from_point(scene.clean, region.centre))))
@@ -169,7 +168,7 @@ MEASURED = {
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_what_is_measured_in_a_picture(name: str) -> None:
-    found = figures(Scene(PICTURES[name](), trail_named=name == "thrown"))
+    found = figures(look(PICTURES[name](), trails=name == "thrown"))
     assert [row[0] for row in found] == [row[0] for row in MEASURED[name]]
     for row, expected in zip(found, MEASURED[name], strict=True):
         assert row[1:] == pytest.approx(expected[1:], rel=0.004, abs=0.004), row

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from cow_service.vision.masks import dilated, scaled_size, three_channels, window_of
-from cow_service.vision.types import Floats, Floats32, Image, Mask
+from cow_service.media.masks import dilated, scaled_size, three_channels, window_of
+from cow_service.media.types import Floats, Floats32, Image, Mask
 
 
 class FillRules(NamedTuple):

@@ -12,12 +12,12 @@ import pytest
 from drawn import Image, floor, jpeg, png_bytes
 from drawn import ball as shaded_ball
 
+from cow_service.media.masks import CroppedMask, bbox_of, pieces_of
+from cow_service.perception.classical.side_view import find_side_view
+from cow_service.perception.observation import look
 from cow_service.records import Answer
 from cow_service.requests import AnswerRequest
 from cow_service.service import Service
-from cow_service.vision.masks import bbox_of
-from cow_service.vision.scene import Scene
-from cow_service.vision.side_view import find_side_view, pieces_of
 
 pytestmark = pytest.mark.slow
 
@@ -159,19 +159,19 @@ def test_a_solid_block_is_no_box_drawn_over_the_picture() -> None:
     image = np.full((600, 900, 3), (238, 246, 255), np.uint8)
     image[430:] = 201, 178, 138
     image[250:430, 760:801] = 32, 160, 64
-    scene = Scene(image)
+    scene = look(image)
     assert scene.boxes == ()
-    assert [region.bbox[0] for region in scene.regions] == [760]
+    assert [region.bbox[0] for region in scene.things] == [760]
     framed = cv2.rectangle(image.copy(), (300, 200), (420, 380), (220, 30, 30), 3)
-    assert len(Scene(framed).boxes) == 1
+    assert len(look(framed).boxes) == 1
 
 
 def test_what_is_grounded_is_no_annotation() -> None:
     image = cv2.rectangle(floor().copy(), (300, 150), (360, 260), (220, 30, 30), 3)
-    scene = Scene(np.ascontiguousarray(image))
+    scene = look(np.ascontiguousarray(image))
     (frame,) = scene.boxes
     thing = bbox_of(frame.mask)
-    scene.preset_mask(thing, lambda: frame.mask)
+    scene = scene.with_masks({thing: CroppedMask.of(frame.mask)})
     assert scene.keeping([thing]).boxes == ()
     assert not scene.keeping([thing]).cues.any()
     assert scene.keeping([(0.0, 0.0, 50.0, 50.0)]) is scene

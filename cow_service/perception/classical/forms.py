@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cow_service.media.masks import hull
+from cow_service.perception.base import Thing
 from cow_service.records import Shape
-from cow_service.vision.masks import hull
-from cow_service.vision.regions import Region
 
 Range = tuple[float, float]
 
@@ -78,45 +78,45 @@ def form_of(noun: str | None) -> str | None:
     return _FORMS.get(noun or "")
 
 
-def is_unlike(region: Region, form: str) -> bool:
+def is_unlike(thing: Thing, form: str) -> bool:
     """Whether an outline is not that of a row of `OUTLINES`: another one's, or that of a torn or half hidden thing."""
-    if is_cut(region, form):
+    if is_cut(thing, form):
         return False
     is_box = form == "box"  # which may be flat, or as high as a tower
-    measured = [0.0, *_measures(region)[1:]] if is_box else _measures(region)
+    measured = [0.0, *_measures(thing)[1:]] if is_box else _measures(thing)
     most = FORM.less_than_round if form == "ball" else FORM.contradicts  # of a lit cap neither foot nor size are seen
-    return _misfit(measured, form) >= most or (not is_box and log_ratio(region, form) < FORM.unlike)
+    return _misfit(measured, form) >= most or (not is_box and log_ratio(thing, form) < FORM.unlike)
 
 
-def looks_like(region: Region) -> str | None:
+def looks_like(thing: Thing) -> str | None:
     """The noun of the one row of `OUTLINES` that an outline clearly is; None if it could be many things."""
-    if region.is_hidden or is_cut(region, "ball"):
+    if thing.is_hidden or is_cut(thing, "ball"):
         return None
-    ratio, form = max((log_ratio(region, form), form) for form in _TELLING)
+    ratio, form = max((log_ratio(thing, form), form) for form in _TELLING)
     return form if ratio >= _CLEARLY else None
 
 
-def shape_seen(region: Region) -> Shape | None:
+def shape_seen(thing: Thing) -> Shape | None:
     """The shape that a disc or an outline clearly shows, whatever the thing is called; None if it could be several."""
-    return "sphere" if region.is_disc else _ROUND.get(looks_like(region) or "")
+    return "sphere" if thing.is_disc else _ROUND.get(looks_like(thing) or "")
 
 
-def is_other_kind(region: Region, noun: str | None) -> bool:
+def is_other_kind(thing: Thing, noun: str | None) -> bool:
     """Whether an outline certainly belongs to another kind of object; not certain if it is torn."""
     form = form_of(noun)
-    if form is None or is_cut(region, form):
+    if form is None or is_cut(thing, form):
         return False
-    measured = _measures(region)
+    measured = _measures(thing)
     misfits = {name: _misfit(measured, name) for name in OUTLINES}
     return misfits[form] >= 2 * FORM.contradicts and min(misfits.values()) < FORM.fits
 
 
-def log_ratio(region: Region, form: str) -> float:
+def log_ratio(thing: Thing, form: str) -> float:
     """Natural logarithm of how much more likely an outline is under a row of `OUTLINES` than under the others."""
     rivals = OUTLINES.keys() - _SAME.get(form, {form, "box"})
-    measured = _measures(region)
+    measured = _measures(thing)
     densities = {
-        name: _density(measured, name) * (FORM.circle if (name == "ball") == region.is_disc else 1 - FORM.circle)
+        name: _density(measured, name) * (FORM.circle if (name == "ball") == thing.is_disc else 1 - FORM.circle)
         for name in (form, *rivals)
     }
     own = densities.pop(form)
@@ -131,14 +131,14 @@ def _density(measured: Sequence[float], form: str) -> float:
     return (1 - FORM.odd) * math.exp(-_misfit(measured, form)) / integral + FORM.odd
 
 
-def is_cut(region: Region, form: str) -> bool:
-    """Whether the outline under a row of `OUTLINES` is not known: the border cuts the region, or a thing hides a part.
+def is_cut(thing: Thing, form: str) -> bool:
+    """Whether the outline under a row of `OUTLINES` is not known: the border cuts the thing, or a thing hides a part.
 
     What is half hidden is believed to be something plain, but nothing with an outline of its own, such as a vase.
     """
-    height, width = region.mask.shape
-    x0, y0, x1, y1 = region.bbox
-    return (region.is_hidden and form in _PLAIN) or x0 <= 1 or y0 <= 1 or x1 >= width - 1 or y1 >= height - 1
+    height, width = thing.mask.shape
+    x0, y0, x1, y1 = thing.bbox
+    return (thing.is_hidden and form in _PLAIN) or x0 <= 1 or y0 <= 1 or x1 >= width - 1 or y1 >= height - 1
 
 
 def _misfit(measured: Sequence[float], form: str) -> float:
@@ -149,9 +149,9 @@ def _misfit(measured: Sequence[float], form: str) -> float:
     return sum(max(0.0, low - value, value - high) / step for value, (low, high), step in each)
 
 
-def _measures(region: Region) -> list[float]:
+def _measures(thing: Thing) -> list[float]:
     """What `OUTLINES` has ranges of, the first as a natural logarithm."""
-    mask = region.mask.patch
+    mask = thing.mask.patch
     height, width = mask.shape
     filled = np.count_nonzero(mask) / np.count_nonzero(hull(mask))
     # The median width in each of the bands, over the largest of them.
@@ -162,18 +162,18 @@ def _measures(region: Region) -> list[float]:
 
 
 class NamingRules(NamedTuple):
-    """What speaks for and against a region that a noun and a colour name, as log ratios.
+    """What speaks for and against a thing that a noun and a colour name, as log ratios.
 
     Set by hand on rendered scenes of the first family and on drawn things; no single number has a measurement of its
     own.
     """
 
     clearly_worse: float = 2.5  # what is so much less likely than the best, twelve times, is not meant
-    exact: float = 6.0  # of the name of a region's colour
+    exact: float = 6.0  # of the name of a thing's colour
     near: float = 3.0  # of others that people may use for it
     least: float = -2.0  # lowest evidence of an outline; the highest is `clearly_worse`
     cut: float = 0.5  # share of its log ratio that an outline keeps which the border cuts
-    round: float = 0.76  # roundness from which a region passes for a ball; a cube has about 0.7
+    round: float = 0.76  # roundness from which a thing passes for a ball; a cube has about 0.7
     not_round: float = 0.6  # roundness below which nothing passes for a ball
     called: float = 3.0  # if a detector found the noun: for its finds
     not_called: float = -2.0  # the same for the rest
@@ -187,30 +187,30 @@ IMPOSSIBLE = -math.inf
 SOLID = frozenset(["glass", "chair", "book", "lamp", "robot", "pencil", "pen"])
 
 
-def likeness(regions: Sequence[Region], noun: str | None, head: str | None, colour: str | None) -> list[float]:
-    """The log ratio of each region to be the thing with that noun, whose last word is `head`, and colour."""
-    ratios, is_found = list[float](), any(noun in region.called for region in regions)
-    for region in regions:
-        tint, shape = 0.0, shape_ratio(region, head, colour is not None)
+def likeness(things: Sequence[Thing], noun: str | None, head: str | None, colour: str | None) -> list[float]:
+    """The log ratio of each thing to be the thing with that noun, whose last word is `head`, and colour."""
+    ratios, is_found = list[float](), any(noun in thing.called for thing in things)
+    for thing in things:
+        tint, shape = 0.0, shape_ratio(thing, head, colour is not None)
         if colour is not None:
-            near = NAMING.near if colour in region.colours else IMPOSSIBLE
-            tint = NAMING.exact if region.colour == colour else near
-        if noun in region.called:  # outlines of real things are of many forms
+            near = NAMING.near if colour in thing.colours else IMPOSSIBLE
+            tint = NAMING.exact if thing.colour == colour else near
+        if noun in thing.called:  # outlines of real things are of many forms
             ratios.append(max(shape, NAMING.least) + tint + NAMING.called)
         else:
             ratios.append(shape + tint + (NAMING.not_called if is_found else 0.0))
     return ratios
 
 
-def shape_ratio(region: Region, head: str | None, has_colour: bool) -> float:
+def shape_ratio(thing: Thing, head: str | None, has_colour: bool) -> float:
     """The log ratio by outline alone; one that the border cuts says less. Without a colour a ball must be round."""
     form = form_of(head)
-    # A region is round where the noun names something round, and not where it does not.
-    can_be = not region.is_disc or (form is None and head not in SOLID)
+    # A thing is round where the noun names something round, and not where it does not.
+    can_be = not thing.is_disc or (form is None and head not in SOLID)
     if form == "ball":
-        round_enough = region.roundness >= (NAMING.not_round if has_colour or region.is_hidden else NAMING.round)
-        can_be = round_enough or (region.is_hidden and has_colour)
+        round_enough = thing.roundness >= (NAMING.not_round if has_colour or thing.is_hidden else NAMING.round)
+        can_be = round_enough or (thing.is_hidden and has_colour)
     if form is None or not can_be:
         return 0.0 if can_be else IMPOSSIBLE
-    ratio = min(NAMING.clearly_worse, max(NAMING.least, log_ratio(region, form)))
-    return NAMING.cut * ratio if is_cut(region, form) else ratio
+    ratio = min(NAMING.clearly_worse, max(NAMING.least, log_ratio(thing, form)))
+    return NAMING.cut * ratio if is_cut(thing, form) else ratio

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision import masks
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.types import Floats32, Image, Mask
+from cow_service.media import masks
+from cow_service.media.masks import CroppedMask
+from cow_service.media.types import Image, Mask
 
 
 class DrawingRules(NamedTuple):
@@ -153,28 +153,3 @@ def _shapes(labels: NDArray[np.uint8], rest: Mask) -> list[CroppedMask]:
     whole = [replace(body, patch=masks.without_holes(body.patch)) for body in large]
     # Small holes are patterns on a shape: nothing has room in them.
     return [filled if body.area > 0.8 * filled.area else body for body, filled in zip(large, whole, strict=True)]
-
-
-def pieces_of(shape: CroppedMask) -> list[Floats32]:
-    """A shape as convex pieces: corners [N, 2] each, px of the image; of what is not convex its rows, in slabs."""
-    x0, y0, _, _ = shape.bbox
-    patch = shape.patch
-    outline = masks.outer_contour(patch).reshape(-1, 2).astype(np.float32)
-    hull = cv2.convexHull(outline).reshape(-1, 2)
-    if shape.area > 0.94 * cv2.contourArea(hull):
-        corners = cv2.approxPolyDP(hull, 0.75, True).reshape(-1, 2)
-        return [(corners + np.array([x0, y0])).astype(np.float32)]
-    slabs = list[tuple[int, int, int, int]]()  # left, top, right, bottom
-    open_ones: dict[tuple[int, int], int] = {}
-    even = max(2, patch.shape[1] // 30)
-    for row in range(len(patch) + 1):
-        edges = np.diff(np.pad(patch[row].astype(np.int8), 1)) if row < len(patch) else np.zeros(1, np.int8)
-        runs = list(zip(np.nonzero(edges == 1)[0].tolist(), np.nonzero(edges == -1)[0].tolist(), strict=True))
-        going: dict[tuple[int, int], int] = {}
-        for left, right in runs:
-            same = [run for run in open_ones if abs(run[0] - left) <= even and abs(run[1] - right) <= even]
-            going[same[0] if same else (left, right)] = open_ones.pop(same[0]) if same else row
-        slabs += [(left, top, right, row) for (left, right), top in open_ones.items()]
-        open_ones = going
-    corners = [[(left, top), (right, top), (right, low), (left, low)] for left, top, right, low in slabs]
-    return [np.array(each, np.float32) + np.array([x0, y0], np.float32) for each in corners]

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.media.masks import bbox_of, mask_iou, outer_contour, outline_of, resized_mask, scaled
+from cow_service.media.types import Floats, Floats32, Image, Mask
 from cow_service.records import BBox
-from cow_service.vision.masks import bbox_of, mask_iou, outer_contour, outline_of, resized_mask, scaled
-from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 
 class CutRules(NamedTuple):

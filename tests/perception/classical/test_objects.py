@@ -16,7 +16,7 @@ from cow_service.readers.base import ReadResult
 from cow_service.records import GroundingRequest, ObjectRequest, Reading
 from cow_service.requests import ImageArtifact, SimulateRequest
 from cow_service.service import Service
-from cow_service.stages.grounding import ground
+from cow_service.stages.grounding import ground, look_again
 
 MOVER = (160, 160, 240, 240)
 CUBE = (400, 220, 480, 300)
@@ -66,8 +66,8 @@ def test_a_mask_gives_box_and_outline_and_is_found_again(pixels: np.ndarray) -> 
     assert disc.mask is not None
     assert disc.mask.sha256 in result.artifacts
     assert (decode_own(again.backends.artifacts.read(disc.mask.sha256))[..., 0] == mask).all()
-    scene = run.scene_of(result.value)  # of a run that has found the grounding stored
-    assert (scene.silhouette(disc.bbox) == (mask > 0)).all()
+    seen = look_again(run, result.value)  # of a run that has found the grounding stored
+    assert (seen.mask_in(disc.bbox).full() == (mask > 0)).all()
 
 
 def test_the_mover_may_be_given_by_mask(pixels: np.ndarray) -> None:
@@ -77,7 +77,7 @@ def test_the_mover_may_be_given_by_mask(pixels: np.ndarray) -> None:
     assert mover.bbox == (170, 170, 231, 231)
     assert mover.prior is not None
     assert mover.prior.shape == "sphere"
-    assert (run.scene_of(mover).silhouette(mover.bbox) == (mask > 0)).all()
+    assert (look_again(run, mover).mask_in(mover.bbox).full() == (mask > 0)).all()
 
 
 @pytest.mark.parametrize(

@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.media.masks import dilated, outer_contour, outline_of
+from cow_service.media.types import Floats, Floats32, Mask
+from cow_service.perception.classical.circles import fit_circle
+from cow_service.perception.classical.contrast import VIEW, View
 from cow_service.records import BBox
-from cow_service.vision.circles import fit_circle
-from cow_service.vision.contrast import VIEW, View
-from cow_service.vision.masks import dilated, outer_contour, outline_of
-from cow_service.vision.types import Floats, Floats32, Mask
 
 
 class DiscRules(NamedTuple):

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from cow_service.vision.masks import CroppedMask, dilated, scaled
-from cow_service.vision.types import Floats, Image, Mask
+from cow_service.media.masks import CroppedMask, dilated, scaled
+from cow_service.media.types import Floats, Image, Mask
+from cow_service.physics.vanishing import lengths_of
 
 
 class SegmentRules(NamedTuple):
@@ -48,11 +49,6 @@ def find_segments(image: Image, drawn: Mask) -> Floats:
     grown = dilated(drawn, SEGMENT.drawing_reach)
     x, y = np.clip(_samples(segments).astype(int), 0, np.array(drawn.shape[::-1]) - 1).transpose(2, 0, 1)
     return segments[~grown[y, x].any(axis=0)]
-
-
-def lengths_of(segments: Floats) -> Floats:
-    """Lengths [N] (px) of segments [N, 4] (px)."""
-    return np.hypot(*(segments[:, 2:] - segments[:, :2]).T)
 
 
 def divide(segments: Floats, masks: Sequence[CroppedMask]) -> tuple[list[Floats], Floats]:

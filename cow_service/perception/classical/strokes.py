@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cow_service.vision.masks import eroded, scaled, without_holes
-from cow_service.vision.types import Image, Mask
+from cow_service.media.masks import eroded, scaled, without_holes
+from cow_service.media.types import Image, Mask
 
 
 class StrokeRules(NamedTuple):

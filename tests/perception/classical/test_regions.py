@@ -11,12 +11,12 @@ from drawn import Image, ball, block, floor, jpeg
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cow_service.media.masks import bbox_of, iou
+from cow_service.perception.classical.contrast import colour_name, colour_names
+from cow_service.perception.classical.regions import find_regions
+from cow_service.perception.classical.segmentation import mask_from_bbox
+from cow_service.perception.observation import look
 from cow_service.records import LocatedObject
-from cow_service.vision.contrast import colour_name, colour_names
-from cow_service.vision.masks import bbox_of, iou
-from cow_service.vision.regions import find_regions
-from cow_service.vision.scene import Scene
-from cow_service.vision.segmentation import mask_from_bbox
 
 RED, ORANGE, YELLOW, GREEN, CYAN = (200, 30, 30), (235, 130, 40), (225, 200, 50), (50, 150, 50), (60, 180, 190)
 BLUE, PURPLE, WHITE, PALE, BLACK = (50, 80, 200), (120, 60, 170), (240, 240, 240), (225, 225, 225), (18, 18, 18)
@@ -194,8 +194,8 @@ def test_any_box_gives_a_mask(corner: tuple[float, float], size: tuple[float, fl
 
 def test_obstacles_are_named_by_the_question_first() -> None:
     image = block(ball(floor(), (120, 200), 40, RED), (280, 150, 360, 250), BLUE)
-    scene = Scene(jpeg(ball(image, (500, 200), 35, GREEN)))
-    boxes = {region.colour: region.bbox for region in scene.regions}
+    scene = look(jpeg(ball(image, (500, 200), 35, GREEN)))
+    boxes = {region.colour: region.bbox for region in scene.things}
     obstacles = scene.obstacles(boxes["red"], (LocatedObject(object="big blue cube", bbox=boxes["blue"]),))
     assert [(each.name, each.bbox) for each in obstacles] == [
         ("big blue cube", boxes["blue"]),

@@ -1,11 +1,11 @@
 """Measures the opening of a container that is seen from above: the ellipse of its rim."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from cow_service.vision.masks import CroppedMask
+from cow_service.media.masks import CroppedMask
+from cow_service.physics.seen import Rim, SeenOpening
 
 
 class RimRules(NamedTuple):
@@ -28,21 +28,6 @@ class RimRules(NamedTuple):
 
 
 RIM = RimRules()
-
-
-Rim = tuple[float, float, float, float]  # an ellipse: x, y, half width, half height, px
-
-
-@dataclass(frozen=True)
-class SeenOpening:
-    """The opening of a container, in shares of half its width."""
-
-    inner: float  # half the width of the opening
-    deviation: float  # one standard deviation of its logarithm
-    bottom: float  # half the outer width at its lower end
-    square: bool = False  # four walls, not a round one
-    rim: Rim | None = None  # its ellipse
-    foot_hidden: bool = False  # something stands before its lower end: it is higher than it is seen
 
 
 def measure_opening(mask: CroppedMask, square: bool = False) -> SeenOpening:

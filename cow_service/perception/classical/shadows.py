@@ -6,18 +6,18 @@ or one of several alike is not taken for the shadow: None is returned instead of
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
+from cow_service.media.masks import CroppedMask, lab_of, resized_mask, scaled
+from cow_service.media.types import Floats, Floats32, Image, Mask
+from cow_service.perception.classical.inpainting import quadratic_terms
+from cow_service.physics.seen import Shadow
 from cow_service.records import BBox
-from cow_service.vision.inpainting import quadratic_terms
-from cow_service.vision.masks import lab_of, resized_mask, scaled
-from cow_service.vision.scene import Scene
-from cow_service.vision.types import Floats, Floats32, Mask
 
 
 class ShadowRules(NamedTuple):
@@ -62,16 +62,6 @@ Ellipse = tuple[float, float, float, float]  # centre and half axes, px
 
 
 @dataclass(frozen=True)
-class Shadow:
-    """A shadow on the floor as an ellipse of the image. It does not say where the light is."""
-
-    bbox: BBox  # [x0, y0, x1, y1], px
-    centre: tuple[float, float]  # px
-    spread: tuple[float, float, float]  # px^2: a quarter of the squared half width and height, and the covariance
-    shade: float  # 0..1: how much of the floor's lightness it takes away
-
-
-@dataclass(frozen=True)
 class _Floor:
     """The image below the object at the working size, with other objects blanked out."""
 
@@ -82,20 +72,20 @@ class _Floor:
     stretch: tuple[float, float]  # back to the image's size
 
     @staticmethod
-    def below(bbox: BBox, scene: Scene) -> _Floor:
-        """The floor of a scene below an object in the air."""
+    def below(bbox: BBox, image: Image, others: Sequence[CroppedMask]) -> _Floor:
+        """The floor of an image below an object in the air."""
         scale = min(1.0, SHADOW.working_width / (bbox[2] - bbox[0]))
-        small = scaled(scene.clean, scale)
+        small = scaled(image, scale)
         height, width = small.shape[:2]
-        taken = np.zeros((scene.height, scene.width), bool)
-        for region in scene.regions:
-            region.mask.add_to(taken)
+        taken = np.zeros(image.shape[:2], bool)
+        for mask in others:
+            mask.add_to(taken)
         taken[max(0, int(bbox[1])) : int(np.ceil(bbox[3])), max(0, int(bbox[0])) : int(np.ceil(bbox[2]))] = True
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
         grown = cv2.dilate(resized_mask(taken, (width, height)).astype(np.uint8), kernel) > 0
         top = min(height - 1, max(0, int(bbox[3] * scale)))
         box = (bbox[0] * scale, bbox[1] * scale - top, bbox[2] * scale, bbox[3] * scale - top)
-        return _Floor(lab_of(small)[top:], ~grown[top:], box, top, (scene.width / width, scene.height / height))
+        return _Floor(lab_of(small)[top:], ~grown[top:], box, top, (image.shape[1] / width, image.shape[0] / height))
 
     def candidates(self) -> Iterator[Ellipse]:
         """Upright ellipses below the object that stand out from the ring about them, the clearest first."""
@@ -209,20 +199,17 @@ class _Floor:
         return Shadow(bbox, (px * fx, (py + self.top) * fy), (xx * fx * fx, yy * fy * fy, xy * fx * fy), shade)
 
 
-def find_shadow(scene: Scene, bbox: BBox) -> Shadow | None:
-    """The shadow of the ball in `bbox` [x0, y0, x1, y1]; None if it has none or several patches could be it."""
-
-    def find() -> Shadow | None:
-        if scene.region_of(bbox) is None or bbox[2] - bbox[0] < SHADOW.least_width:
-            return None
-        floor = _Floor.below(bbox, scene)
-        found = [shadow for ellipse in floor.candidates() if (shadow := floor.fit_ellipse(ellipse)) is not None]
-        found.sort(key=lambda shadow: -shadow.shade)
-        if not found or (len(found) > 1 and found[1].shade > SHADOW.rival_shade * found[0].shade):
-            return None
-        return found[0]
-
-    return scene.once(("shadow", bbox), find)
+def find_shadow(image: Image, things: Sequence[CroppedMask], bbox: BBox) -> Shadow | None:
+    """The shadow of the ball in a box on what the things of an image leave free; None if it has none or several
+    patches could be it."""
+    if bbox[2] - bbox[0] < SHADOW.least_width:
+        return None
+    floor = _Floor.below(bbox, image, things)
+    found = [shadow for ellipse in floor.candidates() if (shadow := floor.fit_ellipse(ellipse)) is not None]
+    found.sort(key=lambda shadow: -shadow.shade)
+    if not found or (len(found) > 1 and found[1].shade > SHADOW.rival_shade * found[0].shade):
+        return None
+    return found[0]
 
 
 def _soft_ellipse(points: Floats, parameters: Floats) -> Floats:

@@ -8,8 +8,8 @@ from drawn import bowl, floor
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.openings import measure_opening
+from cow_service.media.masks import CroppedMask
+from cow_service.perception.classical.openings import measure_opening
 
 
 @given(half=st.floats(25, 90), base=st.floats(0.4, 0.9), seed=st.integers(0, 3))

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from cow_service.media.masks import lab_of, scaled
+from cow_service.media.types import Floats, Image, Mask
+from cow_service.perception.classical.contrast import VIEW, lab_gradients
 from cow_service.records import Point
-from cow_service.vision.contrast import VIEW, lab_gradients
-from cow_service.vision.masks import lab_of, scaled
-from cow_service.vision.types import Floats, Image, Mask
 
 
 class CircleRules(NamedTuple):

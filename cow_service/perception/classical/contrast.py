@@ -12,8 +12,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from cow_service.vision.masks import dilated, lab_of, scaled
-from cow_service.vision.types import Floats32, Image
+from cow_service.media.masks import dilated, lab_of, scaled
+from cow_service.media.types import Floats32, Image
 
 
 class ViewRules(NamedTuple):

@@ -14,16 +14,17 @@ from hypothesis import strategies as st
 from refusals import refused
 from runs import run_of
 
+from cow_service.perception.classical.circles import Edges
+from cow_service.perception.classical.trails import find_trails
+from cow_service.perception.observation import look
 from cow_service.physics.camera import FloorCamera, prior
+from cow_service.physics.seen import Position
 from cow_service.physics.trail_fit import fit_throw, is_thrown, straight_direction
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Grounding
 from cow_service.stages.grounding import ground
 from cow_service.stages.motion import settle_motion
 from cow_service.stages.run import Run
-from cow_service.vision.circles import Edges
-from cow_service.vision.scene import Scene
-from cow_service.vision.trails import Position, find_trails
 
 ORANGE, GREEN, PURPLE = (220, 120, 30), (40, 160, 60), (120, 50, 160)
 PLACES = thrown_past((300, 110), (36, -2), 12, 4)  # the oldest first
@@ -59,18 +60,18 @@ def test_what_is_no_trail() -> None:
 
 def test_three_balls_are_a_trail_only_where_the_question_says_so() -> None:
     image = trail(floor(), thrown_past((420, 120), (110, 6), 8, 3), [24.0] * 3, ORANGE, [1.0] * 3)
-    for scene, trails, regions in ((Scene(image), 0, 3), (Scene(image).with_trail_named(), 1, 1)):
-        assert (len(scene.trails), len(scene.regions)) == (trails, regions)
+    for scene, trails, regions in ((look(image), 0, 3), (look(image).with_trails(), 1, 1)):
+        assert (len(scene.trails), len(scene.things)) == (trails, regions)
 
 
 def test_the_earlier_positions_are_taken_out_and_the_present_one_is_whole() -> None:
     x, y = PLACES[0]
-    scene = Scene(OPAQUE, trail_named=True).with_mover((x - 26, y - 26, x + 26, y + 26))
+    scene = look(OPAQUE, trails=True).with_mover((x - 26, y - 26, x + 26, y + 26))
     wanted = ball(SCENE, (x, y), 26, ORANGE)
     off = np.abs(scene.clean.astype(int) - wanted).max(axis=2)
     ys, xs = np.mgrid[: off.shape[0], : off.shape[1]]
     assert np.percentile(off[np.abs(np.hypot(xs + 0.5 - x, ys + 0.5 - y) - 26) > 2.5], 99.5) < 40
-    assert [region.is_disc for region in scene.regions if region.colour == "orange"] == [True]
+    assert [region.is_disc for region in scene.things if region.colour == "orange"] == [True]
     assert len(scene.obstacles((x - 26, y - 26, x + 26, y + 26))) == 1  # the cube, and no earlier position
 
 

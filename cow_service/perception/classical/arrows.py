@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.media.masks import lab_of, mask_iou
+from cow_service.media.types import Floats, Image, Mask
+from cow_service.perception.classical.strokes import STROKE, Stroke, WorkingImage, drawing_mask
 from cow_service.records import BBox, Point
-from cow_service.vision.masks import lab_of, mask_iou
-from cow_service.vision.strokes import STROKE, Stroke, WorkingImage, drawing_mask
-from cow_service.vision.types import Floats, Image, Mask
 
 
 class ArrowRules(NamedTuple):

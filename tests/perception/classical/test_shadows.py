@@ -13,9 +13,9 @@ from drawn import Image, ball, block
 from drawn import floor as drawn_floor
 from floors import TrueCamera, outline
 
+from cow_service.perception.observation import look
+from cow_service.physics.seen import Shadow
 from cow_service.records import BBox
-from cow_service.vision.scene import Scene
-from cow_service.vision.shadows import Shadow, find_shadow
 
 WIDTH, HEIGHT = 512, 320
 
@@ -83,7 +83,7 @@ class Throw:
     def off(self, image: Image, scale: float = 1.0) -> float:
         """How far the shadow that is found is from the truth, in half axes; and it has about the right size."""
         x0, y0, x1, y1 = (scale * side for side in self.ball_bbox)
-        shadow = find_shadow(Scene(image), (x0, y0, x1, y1))
+        shadow = look(image).shadow_below((x0, y0, x1, y1))
         assert shadow is not None
         rim = scale * self.camera.shadow_rim(self.ball, self.light)
         (x, y), (a, b) = rim.mean(axis=0), np.ptp(rim, axis=0) / 2
@@ -110,7 +110,7 @@ def test_the_shadow_is_where_the_light_puts_it(name: str) -> None:
 
 
 def found(image: Image, throw: Throw = PLAIN) -> Shadow | None:
-    return find_shadow(Scene(image), throw.ball_bbox)
+    return look(image).shadow_below(throw.ball_bbox)
 
 
 def test_nothing_else_is_taken_for_the_shadow() -> None:
@@ -139,4 +139,4 @@ def test_what_stands_on_the_floor_has_no_shadow_apart() -> None:
     assert found(throw.image(), throw) is None
     for name in ("ball-and-mug", "bottle-passes-cylinder"):
         scene = example(name)
-        assert find_shadow(Scene(scene.pixels("image.jpg")), tuple(scene.meta["bbox"])) is None
+        assert look(scene.pixels("image.jpg")).shadow_below(tuple(scene.meta["bbox"])) is None

@@ -12,7 +12,7 @@ from drawn import DrawnArrow, angle_between, ball, block, floor, jpeg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cow_service.vision.scene import Scene
+from cow_service.perception.observation import look
 
 COLOURS = {
     "red": (230, 40, 40),
@@ -43,7 +43,7 @@ def test_any_arrow_on_a_floor_is_measured(
     length = max(length, 7.0 * thickness)
     dx, dy = np.cos(angle), np.sin(angle)
     arrow = DrawnArrow((320 - dx * length / 2, 200 - dy * length / 2), angle, length, thickness, COLOURS[colour], style)
-    (found,) = Scene(jpeg(arrow.on(floor()), quality)).arrows
+    (found,) = look(jpeg(arrow.on(floor()), quality)).arrows
     assert angle_between(found.direction, arrow.direction) < 2.5
     assert math.dist(found.tip, arrow.tip) < 3 + thickness
 
@@ -71,7 +71,7 @@ def test_a_hollow_arrow_is_measured(
     image = floor()
     cv2.fillPoly(image, [shape], COLOURS[colours[0]], cv2.LINE_AA, 4)
     cv2.polylines(image, [shape], True, COLOURS[colours[1]], 3, cv2.LINE_AA, 4)
-    scene = Scene(jpeg(image, quality))
+    scene = look(jpeg(image, quality))
     assert len(scene.arrows) == 1
     assert angle_between(scene.arrows[0].direction, (along[0], along[1])) < 2.5
     assert np.abs(scene.clean.astype(int) - floor())[scene.cues].mean() < 12
@@ -83,17 +83,17 @@ def test_things_shaped_like_arrows_are_none() -> None:
     cv2.putText(image, "B7", (450, 120), cv2.FONT_HERSHEY_SIMPLEX, 2, (20, 60, 200), 4, cv2.LINE_AA)
     cv2.circle(image, (520, 300), 30, (30, 160, 30), 4, cv2.LINE_AA)
     cv2.fillPoly(image, [np.array([[300, 250], [340, 330], [260, 330]], np.int32)], (230, 40, 40))
-    assert Scene(jpeg(image)).arrows == ()
+    assert look(jpeg(image)).arrows == ()
     # The side of a can behind a ball, of one dark blue: as broad at one end as a stubby arrow's head.
     can = np.array([[300, 150], [336, 150], [336, 141], [350, 156], [336, 171], [336, 162], [300, 162]], np.int32)
-    assert Scene(jpeg(cv2.fillPoly(floor(grey=220), [can], (10, 15, 110), cv2.LINE_AA))).arrows == ()
+    assert look(jpeg(cv2.fillPoly(floor(grey=220), [can], (10, 15, 110), cv2.LINE_AA))).arrows == ()
 
 
 @pytest.mark.parametrize(("line", "colour"), [(2, "red"), (3, "yellow"), (6, "blue"), (6, "black")])
 def test_a_drawn_box_is_found_around_its_object(line: int, colour: str) -> None:
     image = ball(floor(), (300, 200), 40, (240, 140, 40))
     cv2.rectangle(image, (240, 140), (360, 260), COLOURS[colour], line)
-    scene = Scene(jpeg(image))
+    scene = look(jpeg(image))
     (box,) = scene.boxes
     half = line // 2
     assert box.bbox == pytest.approx([240 + half, 140 + half, 360 - half, 260 - half], abs=2)

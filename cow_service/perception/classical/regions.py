@@ -13,12 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.media import masks
+from cow_service.media.masks import CroppedMask
+from cow_service.media.types import Floats32, Image, Mask
+from cow_service.perception.base import Thing
+from cow_service.perception.classical.completion import as_disc, black_faces, is_top, is_underside, white_sides
+from cow_service.perception.classical.contrast import VIEW, View, colour_name, colour_names, view_of
 from cow_service.records import BBox
-from cow_service.vision import masks
-from cow_service.vision.completion import as_disc, black_faces, is_top, is_underside, white_sides
-from cow_service.vision.contrast import VIEW, View, colour_name, colour_names, view_of
-from cow_service.vision.masks import CroppedMask
-from cow_service.vision.types import Floats32, Image, Mask
 
 
 class RegionRules(NamedTuple):
@@ -70,30 +71,6 @@ _DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
 
 
 @dataclass(frozen=True)
-class Region:
-    """One object of the image: its place and its colour. Not what kind of object it is, nor whether it moves."""
-
-    mask: CroppedMask
-    colour: str
-    colours: frozenset[str]  # all names that people may use for its colour
-    roundness: float  # 0..1, of the smallest circle around it: a disc has 1, a square 0.8, a bottle less than 0.5
-    confidence: float  # 0..1: how sure it is that this is one separable thing with this outline; see `_confidence`
-    is_disc: bool  # its outline was fitted by a circle: the mask is exact, segmenting it again would not improve it
-    is_hidden: bool = False  # by another region in front of it, in part: its outline tells little
-    called: frozenset[str] = frozenset()  # the nouns under which a detector found it
-
-    @property
-    def bbox(self) -> BBox:
-        """Tight box [x0, y0, x1, y1], px of the image."""
-        return self.mask.bbox
-
-    @property
-    def centre(self) -> tuple[float, float]:
-        """Centre of the box, px."""
-        return (self.bbox[0] + self.bbox[2]) / 2, (self.bbox[1] + self.bbox[3]) / 2
-
-
-@dataclass(frozen=True)
 class _Found:
     """One object at the working size."""
 
@@ -102,7 +79,7 @@ class _Found:
     confidence: float
     is_disc: bool
 
-    def region(self, size: tuple[int, int], is_hidden: bool) -> Region:
+    def region(self, size: tuple[int, int], is_hidden: bool) -> Thing:
         """It as a region of the image (height and width)."""
         soft = self.mask.astype(np.float32)
         near = masks.window_of(self.mask, round(6 * REGION.mask_sigma))
@@ -110,11 +87,11 @@ class _Found:
             soft[near] = cv2.GaussianBlur(soft[near], (0, 0), REGION.mask_sigma)
         mask = masks.enlarged(soft, size)
         roundness = masks.roundness_of(mask.patch)
-        return Region(mask, *_names(self.lab), roundness, self.confidence, self.is_disc, is_hidden and not self.is_disc)
+        return Thing(mask, *_names(self.lab), roundness, self.confidence, self.is_disc, is_hidden and not self.is_disc)
 
 
-def find_regions(image: Image) -> tuple[Region, ...]:
-    """Objects of an RGB image [H, W, 3] without drawings on it, largest first; empty for a cluttered image."""
+def find_regions(image: Image, names: Sequence[str] = ()) -> tuple[Thing, ...]:
+    """Things of an RGB image [H, W, 3] without drawings on it, whatever their names; none in a cluttered image."""
     height, width = image.shape[:2]
     view = view_of(masks.scaled(image, min(1.0, VIEW.working_side / max(height, width))))
     solid = _solid(view)
@@ -224,17 +201,11 @@ def _stands_out(view: View, part: Mask) -> bool:
     return float(np.median(steps)) > REGION.out_of_texture * float(np.median(view.spread[outline]))
 
 
-def region_of(regions: Sequence[Region], bbox: BBox) -> Region | None:
-    """The region that best overlaps a box [x0, y0, x1, y1], if it is the same object."""
-    best = max(regions, key=lambda region: masks.iou(region.bbox, bbox), default=None)
-    return best if best is not None and masks.is_same_object(best.bbox, bbox) else None
-
-
-def known_region(image: Image, mask: CroppedMask) -> Region:
+def thing_of(image: Image, mask: CroppedMask) -> Thing:
     """A thing of an RGB image [H, W, 3] whose mask is certain; a disc where that is round."""
     roundness = masks.roundness_of(mask.patch)
     names = _names(masks.lab_of(image[mask.rows, mask.columns][mask.patch][None])[0])
-    return Region(mask, *names, roundness, confidence=1.0, is_disc=roundness > REGION.disc)
+    return Thing(mask, *names, roundness, confidence=1.0, is_disc=roundness > REGION.disc)
 
 
 def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cow_service.media.masks import bbox_of, eroded, lab_of, mask_iou, resized_mask, scaled, without_holes
+from cow_service.media.types import Floats, Floats32, Image, Mask
 from cow_service.physics.camera import FOCAL_WIDTHS, FloorCamera
 from cow_service.records import BBox, Vector
-from cow_service.vision.masks import bbox_of, eroded, lab_of, mask_iou, resized_mask, scaled, without_holes
-from cow_service.vision.types import Floats, Floats32, Image, Mask
 
 PAINT, DARK, OTHER = 1, 2, 3  # labels of pixels, 0 beside it: the body's colour, tyres, and glass and lamps
 Labels = NDArray[np.uint8]
