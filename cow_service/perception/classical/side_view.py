@@ -55,18 +55,12 @@ class SideView:
 def find_side_view(image: Image) -> SideView | None:
     """The side view that an RGB image [H, W, 3] is; None for a picture that has depth, or no level ground."""
     height = image.shape[0]
-    if _flat_colours(np.ascontiguousarray(image[::4, ::4])) is None:  # most pictures end here
+    if _labelled(np.ascontiguousarray(image[::4, ::4])) is None:  # most pictures end here
         return None
-    colours = _flat_colours(image)
-    if colours is None:
+    found = _labelled(image)
+    if found is None:
         return None
-    labels = np.empty(image.shape[:2], np.uint8)
-    for rows in _bands(image):
-        labels[rows] = np.stack([np.abs(image[rows] - colour).sum(axis=2) for colour in colours]).argmin(axis=0)
-    background = int(np.bincount(labels[: max(2, height // 50)].ravel()).argmax())
-    ground, level = _ground(labels, background)
-    if ground is None:
-        return None
+    labels, background, ground, level = found
     rest = (labels != background) & ~masks.dilated(ground, 5)  # its edge is blurred
     open_ground = (labels[level : level + 2] == background).all(axis=0) & ~ground.any(axis=0)
     whole = bool(open_ground.mean() < DRAWING.no_gap)
@@ -80,6 +74,20 @@ def find_side_view(image: Image) -> SideView | None:
     empty = np.full_like(image, image[labels == background].mean(axis=0).round())
     empty[ground] = image[ground]
     return SideView(tuple(shapes), float(level if whole else height), empty)
+
+
+def _labelled(image: Image) -> tuple[NDArray[np.uint8], int, Mask, int] | None:
+    """Which of the few colours of a drawing each pixel has [H, W], the background's, the ground [H, W], and the height
+    in the image of its upper edge; None for a photograph, or where there is no ground."""
+    colours = _flat_colours(image)
+    if colours is None:
+        return None
+    labels = np.empty(image.shape[:2], np.uint8)
+    for rows in _bands(image):
+        labels[rows] = np.stack([np.abs(image[rows] - colour).sum(axis=2) for colour in colours]).argmin(axis=0)
+    background = int(np.bincount(labels[: max(2, image.shape[0] // 50)].ravel()).argmax())
+    ground, level = _ground(labels, background)
+    return None if ground is None else (labels, background, ground, level)
 
 
 def _bands(image: Image) -> Iterator[slice]:
