@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 import pytest
 from drawn import ball, block, floor, trail
 from runs import run_of
 
+from cow_service.errors import CowError
 from cow_service.generators.cutout.generator import CutoutGenerator
 from cow_service.perception import observation
 from cow_service.perception.observation import MOST_IMAGES, MOST_PIXELS, SeenImages, look
@@ -72,3 +75,32 @@ def test_only_the_latest_images_are_kept_each_for_its_owner_alone(monkeypatch: p
     assert not is_kept(None, "0")
     seen.look(("mine", "large"), np.broadcast_to(np.uint8(0), (1, MOST_PIXELS - 2400, 3)))
     assert [is_kept("mine", each) for each in ("0", "1")] == [False, False]
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        {},
+        {"question": QUESTIONS[0].replace("hit the blue block", "hit the blue block if its trail is followed")},
+        {"grounding": {"bbox": (130, 220, 190, 280)}, "objects": [{"object": "blue block", "bbox": BOX}]},
+        {"question": "If the blue block is removed and the red ball moves right, will it hit the wall?"},
+    ],
+)
+def test_no_run_changes_what_others_see(request_: dict) -> None:
+    seen = SeenImages()
+    run = run_of(
+        PICTURE,
+        EmbeddedReader,
+        CutoutGenerator,
+        **{"question": QUESTIONS[0], "video": False, "num_frames": 17} | request_,
+    )
+    run.share(seen)
+    with suppress(CowError):
+        simulate(run)
+    found, fresh = seen.look((None, run.image.info.sha256), run.image.pixels), look(PICTURE)
+    for name in ("image", "cues", "undrawn", "clean"):
+        assert np.array_equal(getattr(found, name), getattr(fresh, name)), name
+    assert [(each.bbox, each.colour, each.mask.area) for each in found.things] == [
+        (each.bbox, each.colour, each.mask.area) for each in fresh.things
+    ]
+    assert (found.masks, found.trails, found.arrows, found.boxes) == ({}, (), (), ())
