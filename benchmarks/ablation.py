@@ -111,7 +111,6 @@ VARIANTS: dict[str, tuple[Patch, ...]] = {
     "black faces": (("perception.classical.regions:black_faces", second),),
     "black": (("perception.classical.regions:_black", empty),),
     "stands out": (("perception.classical.regions:_stands_out", certainly),),
-    "walls": (("perception.classical.regions:_is_wall", never),),
     "ellipses": (("perception.classical.regions:_is_ellipse", never),),
     "colours": (("perception.classical.regions:_coloured_parts", whole),),
     "confidence": (("perception.classical.regions:_confidence", surely),),

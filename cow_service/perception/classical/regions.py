@@ -45,7 +45,6 @@ class RegionRules(NamedTuple):
     halfway: float = 0.35  # of the largest step nearby
     min_area: float = 0.0003  # of the image
     max_area: float = 0.25  # the same, at most
-    along_border: float = 0.5  # of the length of something bright and pale along the image's border: a wall
     most: int = 40  # the largest are kept: the work that follows grows with their number
     clutter: float = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
     split_hue: float = 36.0  # degrees: another colour, hence another object
@@ -97,8 +96,6 @@ def find_regions(image: Image, names: Sequence[str] = ()) -> tuple[Thing, ...]:
     solid = _solid(view)
     border = np.ones(solid.shape, bool)
     border[1:-1, 1:-1] = False
-    walls = border.copy()
-    walls[-1, 1:-1] = False  # what the lower border cuts stands in front
     found: list[_Found] = []
     _, labels, stats, _ = cv2.connectedComponentsWithStats(solid, connectivity=8)
     for i, (x, y, w, h, _) in enumerate(stats.tolist()):
@@ -108,8 +105,6 @@ def find_regions(image: Image, names: Sequence[str] = ()) -> tuple[Thing, ...]:
         window = slice(max(0, y - pad), y + h + pad), slice(max(0, x - pad), x + w + pad)
         near = view.crop(window)
         for part in _parts(near, labels[window] == i):
-            if _is_wall(near, part, walls[window]):
-                continue
             disc = as_disc(part, near.edges, near.edge_threshold)
             if disc is None and not _stands_out(near, part):
                 continue
@@ -217,16 +212,6 @@ def _is_background(stats: NDArray[np.int32], shape: tuple[int, ...]) -> bool:
     spans = w > 0.5 * width or h > 0.75 * height
     sliver = (on_top or on_side) and (area < 0.45 * w * h or min(w, h) < 0.12 * max(w, h))
     return spans or sliver or (on_side and (on_top or on_bottom))
-
-
-def _is_wall(view: View, part: Mask, border: Mask) -> bool:
-    """Whether a pale part runs along the image's border for much of its own length, as a strip of wall does."""
-    along = part & border
-    if not along.any() or np.median(view.bright[part]) <= 0 or np.median(view.chroma[part]) >= 2 * VIEW.chroma_step:
-        return False
-    (rows, columns), (edge_rows, edge_columns) = np.nonzero(part), np.nonzero(along)
-    wide, high = np.ptp(columns) + 1, np.ptp(rows) + 1
-    return bool(np.ptp(edge_columns) > REGION.along_border * wide or np.ptp(edge_rows) > REGION.along_border * high)
 
 
 def _parts(view: View, component: Mask) -> list[Mask]:
