@@ -331,10 +331,11 @@ class Reading(Record):
     objects_complete: Flag = Field(
         default=False, description="`objects` are all that could be hit or hide something: nothing else is looked for."
     )
-    interventions: tuple[InterventionRequest, ...] = Field(
-        default=(),
+    interventions: tuple[InterventionRequest, ...] | None = Field(
+        default=None,
         max_length=MAX_CHANGES,
-        description="Objects to take away or put somewhere before the motion, instead of the question's.",
+        description="Objects to take away or put somewhere before the motion, instead of what the question "
+        "says; an empty list: none.",
     )
     asked: Asked | None = Field(
         default=None, description="What the question wants to know; by default it is read from the question."

@@ -109,9 +109,9 @@ def _settled(run: Run[SimulateRequest], read: ReadResult, known: Sequence[Object
         reading = located(run.scene, read.reading, run.reader.source)
     if not run.reader.heeds_objections:
         return Settled(reading, read.warnings)
-    if request.interventions:
-        said = replace(said, reading=said.reading.model_copy(update={"interventions": ()}))
-        reading = reading.model_copy(update={"interventions": ()})
+    if request.interventions is not None:
+        said = replace(said, reading=said.reading.model_copy(update={"interventions": None}))
+        reading = reading.model_copy(update={"interventions": None})
     others = [each for each in reading.objects if not any(same_name(each.object, one.object) for one in known)]
     if request.objects_complete:
         others = [each for each in others if each.role == "target"]
@@ -219,14 +219,14 @@ def unanswerable(grounding: Grounding, run: Run[SimulateRequest]) -> list[str]:
 def find_interventions(
     request: SimulateRequest, reading: Reading, things: Sequence[LocatedObject]
 ) -> tuple[Intervention, ...]:
-    """Those of the request, else those of the question; the last of `things` is the mover.
+    """Those of the request, an empty list included, else those of the question; the last of `things` is the mover.
 
     Raises `InvalidRequest` for an object that is not there, for what is done twice, for a thing that is put to itself,
     and for the mover taken away; `CannotGround` where the question says so.
     """
-    found = list[Intervention]()
-    given = [(f"/interventions/{index}", change) for index, change in enumerate(request.interventions)]
-    for pointer, change in given or [(None, change) for change in reading.interventions]:
+    found, is_given = list[Intervention](), request.interventions is not None
+    for index, change in enumerate((request.interventions if is_given else reading.interventions) or ()):
+        pointer = f"/interventions/{index}" if is_given else None
         gone = [other.object for other in found if other.kind == "remove"]  # of two with one name, each goes once
         each = with_things(change, (*(thing for thing in things if thing not in gone), *gone), pointer)
         fault = fault_of_removal(each, found, things[-1]) if each.kind == "remove" else fault_of_placing(each, found)

@@ -64,7 +64,7 @@ def digest_of(values: Mapping[str, Any]) -> str:
 
 
 BackendRole = Literal["reader", "generator"]
-FORMAT = 20  # of stored results; raised where what a stage means or stores changes
+FORMAT = 21  # of stored results; raised where what a stage means or stores changes
 
 
 @dataclass(frozen=True)

@@ -328,7 +328,7 @@ def differences(asked: records.Asked, plain: records.Asked, names: Sequence[str]
 
 def removal_faults(read: Reading, said: Reading, names: Sequence[str], words: WordReader) -> list[str]:
     """That the words take away other things than was read."""
-    removed, taken = ([each.object for each in of.interventions if each.kind == "remove"] for of in (said, read))
+    removed, taken = ([each.object for each in of.interventions or () if each.kind == "remove"] for of in (said, read))
     if _are_meant(removed, taken, names, words):
         return []
     told = [", ".join(f"'{name}'" for name in each) or "nothing" for each in (removed, taken)]

@@ -53,7 +53,7 @@ def test_arguments_of_the_tools_are_flat() -> None:
 
 
 def test_arguments_become_a_request() -> None:
-    assert request_fields("simulate", PLAIN | {"seed": None}) == {**PLAIN, "video": False}
+    assert request_fields("simulate", PLAIN | {"seed": None, "remove": [], "place": "[]"}) == {**PLAIN, "video": False}
     full = {"point": [1, 2], "object": "cup", "motion_kind": "fall", "options": '["a","b"]', "reader": "[1]"}
     changed = {"remove": "cup", "place": [{"object": "a", "relation": "on", "targets": ["b"]}, 7]}
     assert request_fields("answer", PLAIN | full | changed) == {
