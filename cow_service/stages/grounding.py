@@ -205,8 +205,8 @@ def unanswerable(grounding: Grounding, run: Run[SimulateRequest]) -> list[str]:
         known = [grounding.object, *(each.object for each in things)]
         named = () if asked is None else (asked.subject, asked.target, *asked.among)
         warnings += [
-            f"The question asks about '{name}', which was not found in the image, so there is no outcome: give it in "
-            "`objects` under this name."
+            f"'{name}' is asked about and was not found in the image, so there is no outcome: give it in `objects` "
+            "under this name."
             for name in named
             if name is not None and not any(same_name(name, each) for each in known)
         ]

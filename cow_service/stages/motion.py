@@ -195,19 +195,18 @@ def seen_way(
 
 
 def fault_of(scene: Scene, grounding: Grounding, said: MotionRequest, seen: SeenWay) -> str:
-    """Why nothing tells which way the mover goes."""
+    """Why nothing tells which way the mover goes, whether the question or the request has said it."""
     name = grounding.object
     if said.along_arrow is not None:
         return arrow_fault(scene, grounding)
     if said.cue == "trail":
-        fault = f"no three positions of the {name} one after another were found in the image"
-        return f"The question speaks of a trail, and {fault}."
+        return f"A trail is to tell the direction, but no three positions of the {name} one after another were found."
     if said.towards is not None:
         return f"Where the {name} moves to is not clear: '{said.towards}' was not located. {GIVE_OBJECT}"
     if said.forward is not None:
-        told = f"The question says that the {name} moves {'forward' if said.forward else 'backward'}."
+        told = f"The {name} is to move {'forward' if said.forward else 'backward'}."
         if grounding.prior is None or not grounding.prior.elongated:
-            return f"{told} Which way they face is seen of vehicles with wheels alone."
+            return f"{told} Which way a thing faces is seen only of vehicles with wheels."
         return f"{told} Which way it faces could not be seen for certain."
     near = len(scene.arrows_near(grounding.bbox))
     return (

@@ -49,6 +49,14 @@ def moved(reading: MotionRequest | None = None, **given_: Any) -> Trajectory:
     return simulate_world(situation, *reconstruct(situation))
 
 
+@pytest.mark.parametrize("way", [{"along_arrow": True}, {"cue": "trail"}, {"forward": True}, {"towards": "vase"}])
+def test_what_is_missing_is_told_in_the_same_words_whoever_said_it(way: dict[str, Any]) -> None:
+    """The question is "?": nothing can be said of what it speaks of."""
+    with refused("cannot-read-direction") as caught:
+        read(None, **way)
+    assert "question" not in caught.value.detail
+
+
 @pytest.mark.parametrize("law", ["contact", "ballistic"])
 def test_a_distance_and_a_turn_and_a_duration(law: str) -> None:
     steps = [{"direction": (-1, 0), "distance": 30}]
