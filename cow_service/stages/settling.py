@@ -133,7 +133,7 @@ def by_words(read: MotionRequest, said: MotionRequest, goal: BBox | None, mover:
     if goal is None:
         return None
     way = way_to(goal, mover, is_on_floor=(read.kind or "linear") == "linear")
-    return _taken(read, way, "text").model_copy(update={"towards": said.towards})
+    return _taken(read, way, "text").model_copy(update={"towards": said.towards or read.towards})
 
 
 def by_front(read: MotionRequest, said: MotionRequest, front: Vector | None) -> MotionRequest | None:

@@ -111,6 +111,19 @@ def test_distances_have_units(distance: Any, pixels: float) -> None:
     assert read(None, direction=(1, 0), distance=distance).value.distance == pytest.approx(pixels)
 
 
+def test_a_goal_is_found_by_what_describes_it_and_reported() -> None:
+    for name in ("blue block", "the big blue block"):
+        found = read(None, towards=name, others=[{"object": "blue block", "towards": "the ball"}]).value
+        assert found.towards == OTHER
+        assert found.direction == pytest.approx((1, 0), abs=0.1)
+        (other,) = found.others
+        assert (other.towards and other.towards.bbox, other.direction) == (BALL, pytest.approx((-1, 0), abs=0.1))
+    with refused("cannot-read-direction"):
+        read(None, towards="ball")
+    with refused("invalid-request", "/motion/others/0/towards"):
+        read(None, direction=(1, 0), others=[{"object": "blue block", "towards": "block"}])
+
+
 def test_a_throw_has_no_length() -> None:
     found = read(MotionRequest(kind="projectile", direction=(1.0, -1.0), cue="text"), duration=2)
     assert found.value.duration is None
