@@ -37,7 +37,7 @@ PLAIN = {"image": "x", "question": "?"}
 
 def test_arguments_of_the_tools_are_flat() -> None:
     given = {"image", "question", "object", "bbox", "point", "direction", "motion_kind", "speed", "num_frames", "seed"}
-    given |= {"towards", "distance", "duration", "until", "remove", "place"}
+    given |= {"towards", "along_arrow", "forward", "cue", "distance", "duration", "until", "remove", "place"}
     given |= {"asked", "law", "objects", "objects_complete", "frames_policy", "frames_count", "generator", "reader"}
     answer = {"options", "votes", "baseline", "imagine", "imagine_votes", "imagine_threshold"}
     for tool, names in (("simulate", given | {"video"}), ("answer", given | answer)):
@@ -68,6 +68,8 @@ def test_arguments_become_a_request() -> None:
             7,
         ],
     }
+    shown = {"along_arrow": False, "forward": True, "cue": "trail", "towards": "cup"}
+    assert request_fields("simulate", PLAIN | shown)["motion"] == shown
     for unknown, said in (("bBox", "bBox"), ("grounding", "grounding (instead: `object`, `bbox`, `point`)")):
         with refused("invalid-request") as caught:
             request_fields("simulate", PLAIN | {unknown: [1, 2]})
