@@ -408,33 +408,25 @@ def reading_of(grounding: Grounding, motion: Motion) -> Reading:
     )
 
 
-def _way_of(way: Motion | AlsoMoving) -> dict[str, Any]:
-    """One way: towards a thing, else a direction."""
+def _way_of(way: Motion | AlsoMoving, form: type[WayRequest]) -> dict[str, Any]:
+    """The fields that a request has under the same names. It takes one way: towards a thing, else a direction."""
+    left_out = {"along_arrow", "towards"}
     if way.kind not in DIRECTED_KINDS:
-        return {}
-    names = ("depth", "speed", "speed_deviation")
-    told = {"direction": way.direction} if way.towards is None else {"towards": way.towards.object}
-    told |= {} if way.towards is not None else {"direction_deviation": way.direction_deviation}
-    return told | {name: getattr(way, name) for name in names}
+        left_out |= {*WayRequest.model_fields, "depth_deviation"}
+    elif way.towards is not None:
+        left_out |= {"direction", "direction_deviation"}
+    said = way.model_dump(include=form.model_fields.keys() - left_out)
+    return said if way.towards is None else said | {"towards": way.towards.object}
 
 
 def _motion_of(motion: Motion) -> MotionRequest:
-    names = ["kind", "law", "other_direction", "cue", "rises", "distance", "duration", "until", "down"]
-    names += ["depth_deviation"] if motion.kind in DIRECTED_KINDS else []
-    way, scale = _way_of(motion), motion.metres_per_pixel
+    said, scale = _way_of(motion, MotionRequest), motion.metres_per_pixel
     if motion.trail:  # by which direction and depth are measured again
-        del way["direction"], way["direction_deviation"]
-    others = ({"object": each.object.object, "kind": each.kind, **_way_of(each)} for each in motion.others)
+        del said["direction"], said["direction_deviation"]
+    others = tuple(_way_of(each, OtherMotionRequest) | {"object": each.object.object} for each in motion.others)
     is_said = scale.source in ("request", "reference") and not scale.note.startswith("by the sizes")
-    return MotionRequest.model_validate(
-        {
-            **{name: getattr(motion, name) for name in names},
-            **way,
-            "steps": tuple(MotionStepRequest.model_validate(each.model_dump()) for each in motion.steps),
-            "others": tuple(map(OtherMotionRequest.model_validate, others)),
-            "metres_per_pixel": scale.value if is_said else None,
-        }
-    )
+    said |= {"others": others, "metres_per_pixel": scale.value if is_said else None}
+    return MotionRequest.model_validate(said)
 
 
 def kept_mask(mask: MaskRef) -> ImageArtifact:

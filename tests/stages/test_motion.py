@@ -11,7 +11,16 @@ from refusals import refused
 from runs import run_of
 
 from cow_service.readers.base import ReadResult
-from cow_service.records import Grounding, LocatedObject, Motion, MotionRequest, Reading, Trajectory
+from cow_service.records import (
+    Grounding,
+    LocatedObject,
+    Motion,
+    MotionRequest,
+    OtherMotionRequest,
+    Reading,
+    Trajectory,
+    reading_of,
+)
 from cow_service.stages.keys import StageResult
 from cow_service.stages.motion import settle_motion
 from cow_service.stages.reconstruction import reconstruct
@@ -122,6 +131,22 @@ def test_a_goal_is_found_by_what_describes_it_and_reported() -> None:
         read(None, towards="ball")
     with refused("invalid-request", "/motion/others/0/towards"):
         read(None, direction=(1, 0), others=[{"object": "blue block", "towards": "block"}])
+
+
+def test_a_reading_has_every_field_of_the_motion() -> None:
+    """All but those that its direction stands for."""
+    step = {"direction": (-1.0, 0.0), "depth": 0.1, "distance": 30.0, "duration": 2.0}
+    way = {"direction": (0.6, 0.8), "direction_deviation": 5.0, "depth": 0.2, "speed": 50.0, "speed_deviation": 0.1}
+    said = {
+        "kind": "linear", "law": "ballistic", **way, "other_direction": (0.0, 1.0), "cue": "arrow", "rises": True,
+        "distance": 60.0, "duration": 3.0, "until": "contact", "steps": (step,), "metres_per_pixel": 0.004,
+        "others": ({"object": "Blue block", "kind": "projectile", **way},), "depth_deviation": 3.0, "down": (0.6, 0.8),
+    }  # fmt: skip
+    carried = reading_of(GROUNDING, read(None, **said).value).motion
+    assert carried is not None
+    assert carried.model_dump(include=said.keys(), exclude={"others": {"__all__": {"towards"}}}) == said
+    assert MotionRequest.model_fields.keys() - said.keys() == {"towards", "along_arrow", "forward"}
+    assert OtherMotionRequest.model_fields.keys() - said["others"][0].keys() == {"towards"}
 
 
 def test_a_throw_has_no_length() -> None:
