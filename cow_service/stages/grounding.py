@@ -194,13 +194,18 @@ def drawings_removed(scene: Scene, words: WordsReading) -> list[str]:
 
 
 def unanswerable(grounding: Grounding, run: Run[SimulateRequest]) -> list[str]:
-    """Warnings where what is asked has no outcome."""
-    warnings, asked = list[str](), grounding.asked
+    """Warnings where what is asked has no outcome, or none that is sure, as the request has it."""
+    warnings, asked, request = list[str](), grounding.asked, run.request
+    places = (*([] if request.grounding is None else [request.grounding]), *request.objects)
+    doubted = [f"'{each.object or grounding.object}'" for each in places if each.is_doubtful]
+    doubted += ["the question"] if request.question_is_doubtful else []
+    if doubted:
+        warnings.append(f"As the request says, {' and '.join(doubted)} may have been misread, so no answer is sure.")
     if name := asked_of_itself(grounding):
         warnings.append(
             f"Something cannot hit itself, so the question about '{name}' has no answer: ask about another object."
         )
-    if run.request.asked is not None or grounding.source != "embedded":  # which warns of what it does not find
+    if request.asked is not None or grounding.source != "embedded":  # which warns of what it does not find
         things = (*others_of(grounding), *removed_of(grounding))
         known = [grounding.object, *(each.object for each in things)]
         named = () if asked is None else (asked.subject, asked.target, *asked.among)

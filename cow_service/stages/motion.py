@@ -95,8 +95,10 @@ def refuse_too_much(motion: Motion) -> None:
 
 
 def assumed(motion: Motion, said: MotionRequest) -> list[str]:
-    """Warnings of what nobody said: how fast a throw is, and the scale of lengths in metres."""
+    """Warnings of a direction given twice, and of what nobody said: a throw's speed, the scale of metres."""
     warnings = list[str]()
+    if motion.other_direction is not None and motion.source == "request":
+        warnings.append("The request gives a second direction (`motion.other_direction`), so no answer is sure.")
     if motion.kind == "projectile" and (said.speed is None or isinstance(said.speed, str)) and not motion.trail:
         warnings.append(
             f"How far a throw goes depends on its speed: {motion.speed:.0f} px/s was assumed; `motion.speed` sets it."
