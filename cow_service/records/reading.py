@@ -383,6 +383,10 @@ def _place_of(thing: LocatedObject | Grounding) -> dict[str, Any]:
 
 def reading_of(grounding: Grounding, motion: Motion) -> Reading:
     """What stages 1 and 2 came to, as fields of a request: sent back, they give the same trajectory."""
+    changes = [
+        {**dict(each), "object": each.object.object, "targets": [thing.object for thing in each.targets]}
+        for each in grounding.interventions
+    ]
     changed = (thing for each in grounding.interventions for thing in (each.object, *each.targets))
     things = {each.bbox: each for each in (*changed, *grounding.others) if each.bbox != grounding.bbox}
     (x0, y0, x1, y1), (x, y) = grounding.bbox, grounding.point
@@ -393,15 +397,7 @@ def reading_of(grounding: Grounding, motion: Motion) -> Reading:
         motion=_motion_of(motion),
         objects=tuple(map(as_said, things.values()))[:MAX_OBJECTS],
         objects_complete=grounding.objects_complete,
-        interventions=tuple(
-            InterventionRequest(
-                kind=each.kind,
-                object=each.object.object,
-                relation=each.relation,
-                targets=tuple(target.object for target in each.targets),
-            )
-            for each in grounding.interventions
-        ),
+        interventions=tuple(map(InterventionRequest.model_validate, changes)),
         asked=grounding.asked,
         question_is_doubtful=grounding.question_is_doubtful,
         language=grounding.language,

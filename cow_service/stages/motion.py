@@ -449,14 +449,9 @@ def completed(
     kind, units = said.stated_kind or "linear", Units(scale, run.image.info.width, run.request.law)
     cue = said.cue or ("request" if source == "request" else CUES.get(kind, "text"))
     usual = DIRECTION_DEVIATIONS[cue]
-    steps = tuple(
-        records.MotionStep(
-            direction=_unit(step.direction),
-            depth=step.depth,
-            distance=units.length(step.distance),
-            duration=step.duration,
-        )
-        for step in said.steps
+    legs = (
+        dict(each) | {"direction": _unit(each.direction), "distance": units.length(each.distance)}
+        for each in said.steps
     )
     way = units.way_of(said, grounding.bbox, usual)
     if kind in DIRECTED_KINDS:
@@ -478,7 +473,7 @@ def completed(
         distance=units.length(said.distance),
         duration=said.duration,
         until=said.until,
-        steps=steps,
+        steps=tuple(map(records.MotionStep.model_validate, legs)),
         others=others_moving(run, grounding, said, units, said.direction_deviation or usual),
         gravity=(down[0] * gravity, down[1] * gravity),
         down=down,
