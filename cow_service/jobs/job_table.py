@@ -32,7 +32,8 @@ from cow_service.records.stages import At, Stage, share_done
 from cow_service.requests import AnswerRequest, Priority, SimulateRequest
 from cow_service.stages.keys import FORMAT, digest_of
 
-VERSION = "2"  # of the workflow that computes jobs; those of another version wait for a server that has it
+VERSION = "3"  # of jobs; raised in a release whose requests may say what workers of the one before do not understand
+READABLE = ("2", VERSION)  # versions of the jobs that are computed here; those of others wait for a process of theirs
 MAX_DEATHS = 20  # of processes that had a job
 RATE_SECONDS = 300.0  # over which ended jobs are counted
 MIN_ENDS = 2  # in that time, from which on a rate is known
@@ -204,7 +205,7 @@ class JobTable:
         return True
 
     def waiting_queues(self) -> list[str]:
-        """The queues in which jobs of this version wait."""
+        """The queues in which jobs wait that can be computed here."""
         query = sa.select(JOBS.c.queue).distinct().where(*_WAITS)
         return [row.queue for row in self._database.read(query)]
 
@@ -459,7 +460,7 @@ class JobTable:
         return {"position": position, "expected_wait": None if wait is None else round(wait, 1)}
 
 
-_WAITS = JOBS.c.status == "queued", JOBS.c.executor.is_(None), JOBS.c.version == VERSION
+_WAITS = JOBS.c.status == "queued", JOBS.c.executor.is_(None), JOBS.c.version.in_(READABLE)
 _ORDER = JOBS.c.turn, JOBS.c.created_at, JOBS.c.id
 _RELEASED = {"status": "queued", "executor": None, "run": None}
 _OF_OWNER = JOBS.c.owner.is_not_distinct_from(sa.bindparam("owner", type_=sa.Text))

@@ -16,7 +16,7 @@ from cow_service import __version__
 from cow_service.errors import NotReady, StorageUnavailable
 from cow_service.jobs.computing import Computer, EngineParts
 from cow_service.jobs.database import Database
-from cow_service.jobs.job_table import RATE_SECONDS, VERSION, OpenCount
+from cow_service.jobs.job_table import RATE_SECONDS, READABLE, VERSION, OpenCount
 from cow_service.jobs.queues import LIGHT, known_queues, queue_of
 from cow_service.jobs.schema import ALIVE_SECONDS, PROCESSES
 from cow_service.observability.logging import rfc3339
@@ -96,7 +96,8 @@ class Processes:
         """Raises `NotReady` if no process takes the jobs of the default request, or those of another version."""
         found, settings = self.overview(), self._settings
         queue = queue_of(settings.reader, settings.generator, settings)
-        if settings.role == "api" and not _serving(found.processes, queue, VERSION):
+        own = (one for one in found.processes if one.workflow_version == VERSION)
+        if settings.role == "api" and not any(queue in one.queues for one in own):
             raise NotReady(remedy(Unserved(queue=queue, workflow_version=VERSION, jobs=1, reason="queue")))
         for one in found.unserved:
             if one.reason == "version":
@@ -142,11 +143,12 @@ def alive(database: Database) -> tuple[ProcessInfo, ...]:
 def unserved(processes: Sequence[ProcessInfo], counts: Iterable[OpenCount]) -> tuple[Unserved, ...]:
     """Queued jobs that none of these processes takes."""
     waiting = _sums(((one.workflow_version, one.queue), one.jobs) for one in counts if one.state == "queued")
-    versions = {process.workflow_version for process in processes if process.queues}
     found: list[Unserved] = []
     for (version, queue), jobs in sorted(waiting.items()):
-        if not _serving(processes, queue, version):
-            reason: Literal["version", "queue"] = "queue" if version in versions else "version"
+        knowing = {version, VERSION} if version in READABLE else {version}  # versions of the processes that compute it
+        able = [one for one in processes if one.workflow_version in knowing]
+        if not any(queue in one.queues for one in able):
+            reason: Literal["version", "queue"] = "queue" if any(one.queues for one in able) else "version"
             found.append(Unserved(queue=queue, workflow_version=version, jobs=jobs, reason=reason))
     return tuple(found)
 
@@ -177,10 +179,6 @@ def _sums(numbers: Iterable[tuple[Key, int]]) -> Counter[Key]:
     for key, number in numbers:
         sums[key] += number
     return sums
-
-
-def _serving(processes: Iterable[ProcessInfo], queue: str, version: str) -> bool:
-    return any(queue in one.queues and one.workflow_version == version for one in processes)
 
 
 def _queues(

@@ -70,10 +70,10 @@ def request_fields(tool: ToolName, arguments: Mapping[str, Any]) -> dict[str, An
         if isinstance(argument, str) and known[name].get("type") != "string":
             with suppress(ValueError):  # some clients write lists and numbers as JSON in a string
                 value = json.loads(argument)
-        if name in _CHANGES:
-            put(request, "interventions", _changes(name, value))
-        else:
+        if name not in _CHANGES:
             put(request, NESTED.get(name, name), value)
+        elif value != []:  # models fill in empty lists: the question's changes stay
+            put(request, "interventions", _changes(name, value))
     return request
 
 

@@ -77,16 +77,15 @@ def chosen_names(outcome: Outcome, say: Phrases) -> str:
     return say("nothing" if outcome.is_needless or is_open else "none-of-them")
 
 
-def why_unsure(outcome: Outcome, in_worlds: bool, say: Phrases) -> str:
+def why_unsure(outcome: Outcome, trajectory: Trajectory, say: Phrases) -> str:
     """Why the simulation cannot tell at all, in a sentence; empty where it gives an answer, sure or not."""
     if outcome.asked.target is not None and outcome.object is None:
         return say("unsure-not-found")
     if "depth" in outcome.depends_on:
         return say("unsure-depth")
     if outcome.probability is None or (outcome.asked.form == "how-many" and outcome.count is None):
-        may_tell = not outcome.asked.among and outcome.asked.relation in (*KINDS, *OF_TARGET)
-        unseen = "unsure-no-outcome" if outcome.asked.form in _OF_EACH and not may_tell else "unsure-unseen"
-        return say(unseen if in_worlds else "unsure-uncounted")
+        untold = "unsure-no-outcome" if trajectory.encounters_known else "unsure-unseen"
+        return say(untold if trajectory.ensemble else "unsure-uncounted")
     doubt = None if outcome.sure else next((doubt for doubt in _UNSEEN if doubt in outcome.depends_on), None)
     return "" if doubt is None else say(f"unsure-{doubt}")
 
@@ -148,7 +147,7 @@ class _Summary:
     def unsure(self) -> str:
         """Why there is no answer, in a sentence, as in: Probably not: it misses the mug in 41 of 50 versions."""
         outcome, say, share = self._given, self._say, self.share()
-        why = why_unsure(outcome, self._trajectory.ensemble > 0, say)
+        why = why_unsure(outcome, self._trajectory, say)
         if why or share is None:
             return why
         leaning = share >= LEANING

@@ -340,7 +340,7 @@ def arrow_fault(seen: Observation, grounding: Grounding) -> str:
         fault = f"what was found stands elsewhere than the {grounding.object}: {ends}"
     else:
         fault = f"{len(near)} were found, and none is clearly that of the {grounding.object}: {ends}"
-    return f"The question speaks of an arrow, but {fault}."
+    return f"An arrow is to tell the direction, but {fault}."
 
 
 MOST_IMAGES = 8

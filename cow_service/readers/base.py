@@ -64,7 +64,7 @@ class ReaderInput:
     @property
     def sought(self) -> tuple[str, ...]:
         """Names of further objects that the caller wants located, besides those of the question."""
-        changed = (name for each in self.given.interventions for name in (each.object, *each.targets))
+        changed = (name for each in self.given.interventions or () for name in (each.object, *each.targets))
         named = dict.fromkeys((*changed, *(each.object for each in self.given.objects)))
         return tuple(name for name in named if not any(same_name(name, each.object) for each in self.known))
 

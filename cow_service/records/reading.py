@@ -331,10 +331,11 @@ class Reading(Record):
     objects_complete: Flag = Field(
         default=False, description="`objects` are all that could be hit or hide something: nothing else is looked for."
     )
-    interventions: tuple[InterventionRequest, ...] = Field(
-        default=(),
+    interventions: tuple[InterventionRequest, ...] | None = Field(
+        default=None,
         max_length=MAX_CHANGES,
-        description="Objects to take away or put somewhere before the motion, instead of the question's.",
+        description="Objects to take away or put somewhere before the motion, instead of what the question "
+        "says; an empty list: none.",
     )
     asked: Asked | None = Field(
         default=None, description="What the question wants to know; by default it is read from the question."
@@ -382,6 +383,10 @@ def _place_of(thing: LocatedObject | Grounding) -> dict[str, Any]:
 
 def reading_of(grounding: Grounding, motion: Motion) -> Reading:
     """What stages 1 and 2 came to, as fields of a request: sent back, they give the same trajectory."""
+    changes = [
+        {**dict(each), "object": each.object.object, "targets": [thing.object for thing in each.targets]}
+        for each in grounding.interventions
+    ]
     changed = (thing for each in grounding.interventions for thing in (each.object, *each.targets))
     things = {each.bbox: each for each in (*changed, *grounding.others) if each.bbox != grounding.bbox}
     (x0, y0, x1, y1), (x, y) = grounding.bbox, grounding.point
@@ -392,48 +397,32 @@ def reading_of(grounding: Grounding, motion: Motion) -> Reading:
         motion=_motion_of(motion),
         objects=tuple(map(as_said, things.values()))[:MAX_OBJECTS],
         objects_complete=grounding.objects_complete,
-        interventions=tuple(
-            InterventionRequest(
-                kind=each.kind,
-                object=each.object.object,
-                relation=each.relation,
-                targets=tuple(target.object for target in each.targets),
-            )
-            for each in grounding.interventions
-        ),
+        interventions=tuple(map(InterventionRequest.model_validate, changes)),
         asked=grounding.asked,
         question_is_doubtful=grounding.question_is_doubtful,
         language=grounding.language,
     )
 
 
-def _way_of(way: Motion | AlsoMoving) -> dict[str, Any]:
-    """One way: towards a thing, else a direction."""
+def _way_of(way: Motion | AlsoMoving, form: type[WayRequest]) -> dict[str, Any]:
+    """The fields that a request has under the same names. It takes one way: towards a thing, else a direction."""
+    left_out = {"along_arrow", "towards"}
     if way.kind not in DIRECTED_KINDS:
-        return {}
-    names = ("depth", "speed", "speed_deviation")
-    told = {"direction": way.direction} if way.towards is None else {"towards": way.towards.object}
-    told |= {} if way.towards is not None else {"direction_deviation": way.direction_deviation}
-    return told | {name: getattr(way, name) for name in names}
+        left_out |= {*WayRequest.model_fields, "depth_deviation"}
+    elif way.towards is not None:
+        left_out |= {"direction", "direction_deviation"}
+    said = way.model_dump(include=form.model_fields.keys() - left_out)
+    return said if way.towards is None else said | {"towards": way.towards.object}
 
 
 def _motion_of(motion: Motion) -> MotionRequest:
-    names = ["kind", "law", "other_direction", "cue", "rises", "distance", "duration", "until", "down"]
-    names += ["depth_deviation"] if motion.kind in DIRECTED_KINDS else []
-    way, scale = _way_of(motion), motion.metres_per_pixel
+    said, scale = _way_of(motion, MotionRequest), motion.metres_per_pixel
     if motion.trail:  # by which direction and depth are measured again
-        del way["direction"], way["direction_deviation"]
-    others = ({"object": each.object.object, "kind": each.kind, **_way_of(each)} for each in motion.others)
+        del said["direction"], said["direction_deviation"]
+    others = tuple(_way_of(each, OtherMotionRequest) | {"object": each.object.object} for each in motion.others)
     is_said = scale.source in ("request", "reference") and not scale.note.startswith("by the sizes")
-    return MotionRequest.model_validate(
-        {
-            **{name: getattr(motion, name) for name in names},
-            **way,
-            "steps": tuple(MotionStepRequest.model_validate(each.model_dump()) for each in motion.steps),
-            "others": tuple(map(OtherMotionRequest.model_validate, others)),
-            "metres_per_pixel": scale.value if is_said else None,
-        }
-    )
+    said |= {"others": others, "metres_per_pixel": scale.value if is_said else None}
+    return MotionRequest.model_validate(said)
 
 
 def kept_mask(mask: MaskRef) -> ImageArtifact:

@@ -537,7 +537,7 @@ class ProcessInfo(Record):
     host: str | None = Field(default=None, description="Null for callers who do not administer the server.")
     pid: int | None = Field(default=None, description="Null for callers who do not administer the server.")
     version: str = Field(description="Version of COW.")
-    workflow_version: str = Field(description="The process takes only jobs of this version.")
+    workflow_version: str = Field(description="Of its own jobs; it takes those of earlier versions, too.")
     queues: dict[str, int] = Field(
         default_factory=dict, description="Queues that it takes jobs from, and how many jobs of each at the same time."
     )

@@ -32,7 +32,7 @@ FLAT = {  # by the group in the help of a command
     ),
     "Its motion": (
         FlatField("motion/direction", "direction", "direction"),
-        FlatField("motion/towards", "towards", "towards"),
+        *(FlatField(f"motion/{name}", name, name) for name in ("towards", "along_arrow", "forward", "cue")),
         FlatField("motion/kind", "kind", "motion_kind"),
         *(FlatField(f"motion/{name}", name, name) for name in ("speed", "distance", "duration", "until", "law")),
         FlatField("trajectory", "trajectory", None),

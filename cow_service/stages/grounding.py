@@ -113,9 +113,9 @@ def _settled(
         reading = located(observation, read.reading, run.reader.source)
     if not run.reader.heeds_objections:
         return Settled(reading, read.warnings)
-    if request.interventions:
-        said = replace(said, reading=said.reading.model_copy(update={"interventions": ()}))
-        reading = reading.model_copy(update={"interventions": ()})
+    if request.interventions is not None:
+        said = replace(said, reading=said.reading.model_copy(update={"interventions": None}))
+        reading = reading.model_copy(update={"interventions": None})
     others = [each for each in reading.objects if not any(same_name(each.object, one.object) for one in known)]
     if request.objects_complete:
         others = [each for each in others if each.role == "target"]
@@ -206,19 +206,24 @@ def drawings_removed(observation: Observation, words: WordsReading) -> list[str]
 
 
 def unanswerable(grounding: Grounding, run: Run[SimulateRequest]) -> list[str]:
-    """Warnings where what is asked has no outcome."""
-    warnings, asked = list[str](), grounding.asked
+    """Warnings where what is asked has no outcome, or none that is sure, as the request has it."""
+    warnings, asked, request = list[str](), grounding.asked, run.request
+    places = (*([] if request.grounding is None else [request.grounding]), *request.objects)
+    doubted = [f"'{each.object or grounding.object}'" for each in places if each.is_doubtful]
+    doubted += ["the question"] if request.question_is_doubtful else []
+    if doubted:
+        warnings.append(f"As the request says, {' and '.join(doubted)} may have been misread, so no answer is sure.")
     if name := asked_of_itself(grounding):
         warnings.append(
             f"Something cannot hit itself, so the question about '{name}' has no answer: ask about another object."
         )
-    if run.request.asked is not None or grounding.source != "embedded":  # which warns of what it does not find
+    if request.asked is not None or grounding.source != "embedded":  # which warns of what it does not find
         things = (*others_of(grounding), *removed_of(grounding))
         known = [grounding.object, *(each.object for each in things)]
         named = () if asked is None else (asked.subject, asked.target, *asked.among)
         warnings += [
-            f"The question asks about '{name}', which was not found in the image, so there is no outcome: give it in "
-            "`objects` under this name."
+            f"'{name}' is asked about and was not found in the image, so there is no outcome: give it in `objects` "
+            "under this name."
             for name in named
             if name is not None and not any(same_name(name, each) for each in known)
         ]
@@ -231,14 +236,14 @@ def unanswerable(grounding: Grounding, run: Run[SimulateRequest]) -> list[str]:
 def find_interventions(
     request: SimulateRequest, reading: Reading, things: Sequence[LocatedObject]
 ) -> tuple[Intervention, ...]:
-    """Those of the request, else those of the question; the last of `things` is the mover.
+    """Those of the request, an empty list included, else those of the question; the last of `things` is the mover.
 
     Raises `InvalidRequest` for an object that is not there, for what is done twice, for a thing that is put to itself,
     and for the mover taken away; `CannotGround` where the question says so.
     """
-    found = list[Intervention]()
-    given = [(f"/interventions/{index}", change) for index, change in enumerate(request.interventions)]
-    for pointer, change in given or [(None, change) for change in reading.interventions]:
+    found, is_given = list[Intervention](), request.interventions is not None
+    for index, change in enumerate((request.interventions if is_given else reading.interventions) or ()):
+        pointer = f"/interventions/{index}" if is_given else None
         gone = [other.object for other in found if other.kind == "remove"]  # of two with one name, each goes once
         each = with_things(change, (*(thing for thing in things if thing not in gone), *gone), pointer)
         fault = fault_of_removal(each, found, things[-1]) if each.kind == "remove" else fault_of_placing(each, found)

@@ -96,8 +96,10 @@ def refuse_too_much(motion: Motion) -> None:
 
 
 def assumed(motion: Motion, said: MotionRequest) -> list[str]:
-    """Warnings of what nobody said: how fast a throw is, and the scale of lengths in metres."""
+    """Warnings of a direction given twice, and of what nobody said: a throw's speed, the scale of metres."""
     warnings = list[str]()
+    if motion.other_direction is not None and motion.source == "request":
+        warnings.append("The request gives a second direction (`motion.other_direction`), so no answer is sure.")
     if motion.kind == "projectile" and (said.speed is None or isinstance(said.speed, str)) and not motion.trail:
         warnings.append(
             f"How far a throw goes depends on its speed: {motion.speed:.0f} px/s was assumed; `motion.speed` sets it."
@@ -177,20 +179,15 @@ def seen_way(
     run: Run[SimulateRequest], observation: Observation, grounding: Grounding, read: MotionRequest, said: MotionRequest
 ) -> SeenWay:
     """What the image shows of the way of the mover. To be called with `cpu` held."""
-    words, arrow, front = run.backends.words(), observation.arrow_at(grounding.bbox), None
+    arrow, front = observation.arrow_at(grounding.bbox), None
     if said.forward is not None and grounding.prior is not None and grounding.prior.elongated:
         front = facing(observation.clean, observation.mask_in(grounding.bbox).full(), grounding.bbox)
-    goal = said.towards or read.towards
-    others = others_of(grounding) if goal else ()
-    goals = [each for each in others if same_name(each.object, goal or "")]
-    goals = goals or [each for each in others if words.likeness(goal or "", each.object) == "same"]
+    goal = goal_of(run, grounding, said.towards or read.towards, grounding.bbox)
     trail = trail_of(observation.trails, grounding.bbox)
-    if len(goals) != 1 or way_to(goals[0].bbox, grounding.bbox, is_on_floor=False) == (0.0, 0.0):
-        goals = []
     return SeenWay(
         arrow=None if arrow is None else arrow.direction,
         is_only_arrow=len(observation.arrows_near(grounding.bbox)) == 1,
-        goal=goals[0].bbox if goals else None,
+        goal=None if goal is None else goal.bbox,
         front=front,
         trail=None if trail is None else trail.heading,
         is_thrown=trail is not None and is_thrown(trail.positions),
@@ -198,19 +195,18 @@ def seen_way(
 
 
 def fault_of(observation: Observation, grounding: Grounding, said: MotionRequest, seen: SeenWay) -> str:
-    """Why nothing tells which way the mover goes."""
+    """Why nothing tells which way the mover goes, whether the question or the request has said it."""
     name = grounding.object
     if said.along_arrow is not None:
         return arrow_fault(observation, grounding)
     if said.cue == "trail":
-        fault = f"no three positions of the {name} one after another were found in the image"
-        return f"The question speaks of a trail, and {fault}."
+        return f"A trail is to tell the direction, but no three positions of the {name} one after another were found."
     if said.towards is not None:
         return f"Where the {name} moves to is not clear: '{said.towards}' was not located. {GIVE_OBJECT}"
     if said.forward is not None:
-        told = f"The question says that the {name} moves {'forward' if said.forward else 'backward'}."
+        told = f"The {name} is to move {'forward' if said.forward else 'backward'}."
         if grounding.prior is None or not grounding.prior.elongated:
-            return f"{told} Which way they face is seen of vehicles with wheels alone."
+            return f"{told} Which way a thing faces is seen only of vehicles with wheels."
         return f"{told} Which way it faces could not be seen for certain."
     near = len(observation.arrows_near(grounding.bbox))
     return (
@@ -404,14 +400,23 @@ class Units:
         return usual * SPEED_FACTORS[speed or "normal"], SPEED_DEVIATIONS[kind]
 
 
-def goal_of(grounding: Grounding, name: str | None) -> LocatedObject | None:
-    """The thing of that name which something moves towards."""
-    things = (LocatedObject(object=grounding.object, bbox=grounding.bbox), *others_of(grounding))
-    return next((each for each in things if name is not None and same_name(each.object, name)), None)
+def goal_of(run: Run[SimulateRequest], grounding: Grounding, name: str | None, mover: BBox) -> LocatedObject | None:
+    """What moves towards a name heads for: the one thing that has it, else the one that the name describes.
+
+    None where there is none or several, and where it is not clear in which direction it lies from the mover's box.
+    """
+    if name is None:
+        return None
+    own, words = LocatedObject(object=grounding.object, bbox=grounding.bbox), run.backends.words()
+    things = [each for each in (own, *others_of(grounding)) if each.bbox != mover]
+    goals = [each for each in things if same_name(each.object, name)]
+    goals = goals or [each for each in things if words.likeness(name, each.object) == "same"]
+    is_clear = len(goals) == 1 and way_to(goals[0].bbox, mover, is_on_floor=False) != (0.0, 0.0)
+    return goals[0] if is_clear else None
 
 
 def others_moving(
-    grounding: Grounding, said: MotionRequest, units: Units, usual_deviation: float
+    run: Run[SimulateRequest], grounding: Grounding, said: MotionRequest, units: Units, usual_deviation: float
 ) -> tuple[records.AlsoMoving, ...]:
     """What else moves, and how. Raises `InvalidRequest` for what was not located."""
     moving = list[records.AlsoMoving]()
@@ -425,14 +430,14 @@ def others_moving(
                 f"`{field_of(pointer)}`: {detail}: give it in `objects` under this name.",
                 errors=(FieldError(pointer, detail),),
             )
-        goal, way = goal_of(grounding, each.towards), units.way_of(each, things[0].bbox, usual_deviation)
-        ahead = None if goal is None else way_to(goal.bbox, things[0].bbox, is_on_floor=False)
-        if each.towards is not None and each.direction is None and ahead in (None, (0.0, 0.0)):
+        box, way = things[0].bbox, units.way_of(each, things[0].bbox, usual_deviation)
+        goal = goal_of(run, grounding, each.towards, box)
+        if each.towards is not None and each.direction is None and goal is None:
             pointer, detail = f"/motion/others/{index}/towards", f"'{each.towards}' was not located elsewhere"
             message = f"`{field_of(pointer)}`: {detail}: give its box in `objects` under this name."
             raise InvalidRequest(message, errors=(FieldError(pointer, detail),))
-        if ahead is not None and each.direction is None:
-            way["direction"] = _unit(ahead)
+        if goal is not None and each.direction is None:
+            way["direction"] = _unit(way_to(goal.bbox, box, is_on_floor=False))
         moving.append(records.AlsoMoving(object=things[0], towards=goal, **way))
     return tuple(moving)
 
@@ -448,14 +453,9 @@ def completed(
     kind, units = said.stated_kind or "linear", Units(scale, run.image.info.width, run.request.law)
     cue = said.cue or ("request" if source == "request" else CUES.get(kind, "text"))
     usual = DIRECTION_DEVIATIONS[cue]
-    steps = tuple(
-        records.MotionStep(
-            direction=_unit(step.direction),
-            depth=step.depth,
-            distance=units.length(step.distance),
-            duration=step.duration,
-        )
-        for step in said.steps
+    legs = (
+        dict(each) | {"direction": _unit(each.direction), "distance": units.length(each.distance)}
+        for each in said.steps
     )
     way = units.way_of(said, grounding.bbox, usual)
     if kind in DIRECTED_KINDS:
@@ -463,7 +463,7 @@ def completed(
         is_open = kind == "projectile" and not (source == "request" and "depth" in said.model_fields_set)
         usual_depth = THROW_DEPTH_DEVIATION if is_open else 0.0
         way["depth_deviation"] = usual_depth if said.depth_deviation is None else said.depth_deviation
-        way["towards"] = goal_of(grounding, said.towards)
+        way["towards"] = goal_of(run, grounding, said.towards, grounding.bbox)
     else:
         way |= {"direction": None, "depth": 0.0, "speed_deviation": 0.0}
     down, gravity = _unit(said.down), GRAVITY / scale.value if kind in records.FALLING_KINDS else 0.0  # px/s^2
@@ -477,8 +477,8 @@ def completed(
         distance=units.length(said.distance),
         duration=said.duration,
         until=said.until,
-        steps=steps,
-        others=others_moving(grounding, said, units, said.direction_deviation or usual),
+        steps=tuple(map(records.MotionStep.model_validate, legs)),
+        others=others_moving(run, grounding, said, units, said.direction_deviation or usual),
         gravity=(down[0] * gravity, down[1] * gravity),
         down=down,
         metres_per_pixel=scale,

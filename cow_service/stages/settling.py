@@ -133,7 +133,7 @@ def by_words(read: MotionRequest, said: MotionRequest, goal: BBox | None, mover:
     if goal is None:
         return None
     way = way_to(goal, mover, is_on_floor=(read.kind or "linear") == "linear")
-    return _taken(read, way, "text").model_copy(update={"towards": said.towards})
+    return _taken(read, way, "text").model_copy(update={"towards": said.towards or read.towards})
 
 
 def by_front(read: MotionRequest, said: MotionRequest, front: Vector | None) -> MotionRequest | None:
@@ -328,7 +328,7 @@ def differences(asked: records.Asked, plain: records.Asked, names: Sequence[str]
 
 def removal_faults(read: Reading, said: Reading, names: Sequence[str], words: WordReader) -> list[str]:
     """That the words take away other things than was read."""
-    removed, taken = ([each.object for each in of.interventions if each.kind == "remove"] for of in (said, read))
+    removed, taken = ([each.object for each in of.interventions or () if each.kind == "remove"] for of in (said, read))
     if _are_meant(removed, taken, names, words):
         return []
     told = [", ".join(f"'{name}'" for name in each) or "nothing" for each in (removed, taken)]

@@ -297,9 +297,8 @@ TABLE: dict[str, list[tuple[Any, ...]]] = {
          "The multimodal LLM 'Qwen/Qwen3-VL-8B-Instruct' sees nothing in the image that the question could move. "
          "Say where it is with `grounding.point` [x, y] or `grounding.bbox` [x0, y0, x1, y1] in the request.")],
     "cannot-read-direction": [(simulated(motion=None, question="If the red ball moves forward?"),
-         "The question says that the object moves forward. Which way they face is seen of vehicles "
-         "with wheels alone. Say it with `motion.direction` [dx, dy] in the request, in pixels, x right and y "
-         "down.")],
+         "The object is to move forward. Which way a thing faces is seen only of vehicles with wheels. Say it with "
+         "`motion.direction` [dx, dy] in the request, in pixels, x right and y down.")],
     "reader-unavailable": [(without_its_package(errors.ReaderUnavailable),
          "'far' needs the Python package that provides 'no_such_package', which is not installed here. `cow "
          "doctor` shows the line that installs it.")],

@@ -93,7 +93,10 @@ def test_the_server_of_a_file_is_all_that_there_is(tmp_path: Path) -> None:
         found = processes_of(database, settings, "me", "light").overview()
         assert [one.queues for one in found.processes] == [{"light": 3}]
         assert [(one.queue, one.reason) for one in found.unserved] == [("ati", "queue")]
-        with database.transaction() as connection:
-            connection.execute(sa.text("UPDATE cow_jobs SET version = '0' WHERE id = 'ati'"))
-        found = processes_of(database, settings, "me", "light").overview()
-        assert [(one.workflow_version, one.reason) for one in found.unserved] == [("0", "version")]
+        for version, reason in (("0", "version"), ("2", "queue")):
+            with database.transaction() as connection:
+                connection.execute(sa.text(f"UPDATE cow_jobs SET version = '{version}'"))
+            found = processes_of(database, settings, "me", "light").overview()
+            told = {one.queue: (one.workflow_version, one.reason) for one in found.unserved}
+            assert told["ati"] == (version, reason)
+            assert ("light" in told) is (version == "0"), "a job of version 2 is computed here"

@@ -30,12 +30,13 @@ from waiting import eventually
 from cow_service.client import Client
 from cow_service.jobs import opening, schema
 from cow_service.jobs.database import Database
-from cow_service.jobs.job_table import JobSpec, JobTable
+from cow_service.jobs.job_table import VERSION, JobSpec, JobTable
 from cow_service.jobs.schema import METADATA, PROCESSES, SCHEMAS, packed
 from cow_service.media.artifacts import DiskArtifacts
 from cow_service.records import Answer, Simulation
+from cow_service.requests import AnswerRequest
 from cow_service.settings import Settings, SettingsError
-from cow_service.stages.keys import FORMAT
+from cow_service.stages.keys import FORMAT, digest_of
 from cow_service.stages.run import now
 
 OLD_TABLES = (DATA / "schema_1.sql").read_text()
@@ -142,6 +143,27 @@ def test_two_versions_share_a_database(old: Database, tmp_path: Path) -> None:
         assert told == [{"queue": "light", "workflow_version": "1", "jobs": 1, "reason": "version"}]
         assert 'cow_queue_unserved{queue="light",reason="version"} 1.0' in new.http.get("/metrics").text
         assert new.job(foreign)["status"] == "queued"
+
+
+def test_workers_leave_jobs_of_later_versions_and_take_those_of_older_ones(old: Database) -> None:
+    """A worker would fail a job whose request has a field that it does not know."""
+    old.prepare(migrate=True)
+    known, later = (write_old(old, "0" * 64, version=version) for version in ("2", "4"))
+    assert [job.id for job in JobTable(old).take("light", "me", 9, None)] == [known]
+    add_job(old, "own")
+    own, *_ = old.read(sa.text("SELECT version FROM cow_jobs WHERE id = 'own'"))
+    assert own.version == VERSION != "2", "an older worker leaves it, too"
+    found = JobTable(old).find(later, None)
+    assert found is not None
+    assert found.job.status == "queued"
+
+
+def test_what_requests_may_say_belongs_to_a_version() -> None:
+    """If requests may say more than those of the last release: raise `VERSION`, once. Then update the digest."""
+    in_words = ("description", "title", "default")  # do not decide whether a request is valid
+    schema = json.dumps(AnswerRequest.model_json_schema())
+    bare = json.loads(schema, object_hook=lambda it: {k: v for k, v in it.items() if k not in in_words})
+    assert (VERSION, digest_of(bare)[:8]) == ("3", "25ffa6c4")
 
 
 def test_results_and_requests_of_an_older_version_are_read() -> None:

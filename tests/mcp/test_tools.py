@@ -37,7 +37,7 @@ PLAIN = {"image": "x", "question": "?"}
 
 def test_arguments_of_the_tools_are_flat() -> None:
     given = {"image", "question", "object", "bbox", "point", "direction", "motion_kind", "speed", "num_frames", "seed"}
-    given |= {"towards", "distance", "duration", "until", "remove", "place"}
+    given |= {"towards", "along_arrow", "forward", "cue", "distance", "duration", "until", "remove", "place"}
     given |= {"asked", "law", "objects", "objects_complete", "frames_policy", "frames_count", "generator", "reader"}
     answer = {"options", "votes", "baseline", "imagine", "imagine_votes", "imagine_threshold"}
     for tool, names in (("simulate", given | {"video"}), ("answer", given | answer)):
@@ -53,7 +53,7 @@ def test_arguments_of_the_tools_are_flat() -> None:
 
 
 def test_arguments_become_a_request() -> None:
-    assert request_fields("simulate", PLAIN | {"seed": None}) == {**PLAIN, "video": False}
+    assert request_fields("simulate", PLAIN | {"seed": None, "remove": [], "place": "[]"}) == {**PLAIN, "video": False}
     full = {"point": [1, 2], "object": "cup", "motion_kind": "fall", "options": '["a","b"]', "reader": "[1]"}
     changed = {"remove": "cup", "place": [{"object": "a", "relation": "on", "targets": ["b"]}, 7]}
     assert request_fields("answer", PLAIN | full | changed) == {
@@ -68,6 +68,8 @@ def test_arguments_become_a_request() -> None:
             7,
         ],
     }
+    shown = {"along_arrow": False, "forward": True, "cue": "trail", "towards": "cup"}
+    assert request_fields("simulate", PLAIN | shown)["motion"] == shown
     for unknown, said in (("bBox", "bBox"), ("grounding", "grounding (instead: `object`, `bbox`, `point`)")):
         with refused("invalid-request") as caught:
             request_fields("simulate", PLAIN | {unknown: [1, 2]})

@@ -288,14 +288,16 @@ SENTENCES: dict[str, Trajectory] = {
         unsure("touches", None, 0.68, form="which", among=EACH, candidates=ONE, depends_on=("speed",)), ensemble=50
     ),
     "Not sure: the simulation does not tell what the question asks.": world(
-        unsure("leaves", None, None, form="which", among=EACH), ensemble=50
+        unsure("inside", "cube", None), ensemble=50
     ),
     "Not sure: what the question asks about was not found under that name, or may be one of several things; the "
     "warnings say more.": world(unsure("touches", "giraffe", 0.5, object=None), ensemble=50),
     "Not sure: the depth map does not show what matters; the warnings say why.": world(
         unsure("touches", "cube", depends_on=("speed", "depth")), ensemble=50
     ),
-    "Not sure: the objects in the image could not be told apart.": world(unsure("touches", "cube", None), ensemble=50),
+    "Not sure: the objects in the image could not be told apart.": world(
+        unsure("touches", "cube", None), ensemble=50, encounters_known=False
+    ),
     "Not sure: no versions were simulated that could be counted (`ensemble` is 0, or the trajectory was given).": world(
         unsure("touches", None, 0.5, form="how-many")
     ),

@@ -124,7 +124,7 @@ def test_what_no_world_can_tell_is_said_so() -> None:
         why(None, simulated(YES)),
         why(HIT, None),
         why(HIT, Simulation.model_validate(SIMULATION)),
-        why(HIT, simulated(untold)),
+        why(HIT, simulated(untold, encounters_known=False)),
         why(HIT, simulated(untold, ensemble=0)),
     ]
     assert len(set(causes)) == len(causes)

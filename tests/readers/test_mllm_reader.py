@@ -317,11 +317,10 @@ def test_objections_to_a_reading_are_put_to_the_model(mllm, reader, scene) -> No
     assert motion.direction == pytest.approx((-0.2 * scene.width, 0), abs=1)
 
 
-def test_what_the_caller_says_is_not_asked(mllm, reader, scene) -> None:
+@pytest.mark.parametrize("changes", [(InterventionRequest(kind="remove", object="red ball"),), ()], ids=["one", "none"])
+def test_what_the_caller_says_is_not_asked(mllm, reader, scene, changes: tuple[InterventionRequest, ...]) -> None:
     mllm.say(json.dumps({"object": "red ball", "others": []}), json.dumps(PLACE))
-    said = Reading(
-        asked=Asked(relation="touches"), interventions=(InterventionRequest(kind="remove", object="red ball"),)
-    )
+    said = Reading(asked=Asked(relation="touches"), interventions=changes)
     reader.read(ReaderInput(scene.image, QUESTION, scene, given=said, motion_wanted=False))
     schema = mllm.asked[0]["response_format"]["json_schema"]["schema"]
     assert list(schema["properties"]) == ["reasoning", "object", "others", "language"]

@@ -112,6 +112,24 @@ def test_what_a_multimodal_llm_reads_comes_back(name: str, tmp_path: Path) -> No
     assert again.usage.calls == 0
 
 
+@pytest.mark.parametrize(
+    ("field", "doubt"),
+    [("question_is_doubtful", True), ("grounding", {"is_doubtful": True}), ("motion", {"other_direction": [0, 1]})],
+)
+def test_a_doubt_that_is_sent_back_is_told(service: Service, field: str, doubt: Any) -> None:
+    """The answer is not sure, and the warnings say why."""
+    pixels, question = DRAWN["words"]
+    body = {"image": {"artifact": service.keep_image(png_bytes(pixels)).sha256}, "question": question, **SHORT}
+    first, _ = sent_back(service, body)
+    assert first.reading is not None
+    said = json.loads(first.reading.model_dump_json(exclude_defaults=True))
+    said[field] = said[field] | doubt if isinstance(doubt, dict) else doubt
+    again = service.simulate(SimulateRequest.model_validate(body | said))
+    assert again.trajectory.outcome is not None
+    assert not again.trajectory.outcome.sure
+    assert len([warning for warning in again.warnings if "no answer is sure" in warning]) == 1
+
+
 def way_of(service: Service, name: str, motion: dict[str, Any], **given: Any) -> tuple[float, float]:
     """The direction in which what moves in an example sets out, by what a request says of it."""
     folder = EXAMPLES / name

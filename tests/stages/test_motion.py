@@ -11,7 +11,16 @@ from refusals import refused
 from runs import run_of
 
 from cow_service.readers.base import ReadResult
-from cow_service.records import Grounding, LocatedObject, Motion, MotionRequest, Reading, Trajectory
+from cow_service.records import (
+    Grounding,
+    LocatedObject,
+    Motion,
+    MotionRequest,
+    OtherMotionRequest,
+    Reading,
+    Trajectory,
+    reading_of,
+)
 from cow_service.stages.keys import StageResult
 from cow_service.stages.motion import settle_motion
 from cow_service.stages.reconstruction import reconstruct
@@ -47,6 +56,14 @@ def moved(reading: MotionRequest | None = None, **given_: Any) -> Trajectory:
     run_, found = run_with(reading, given_), read(reading, **given_).value
     situation = see(run_, run_.sight.look(), GROUNDING, found)
     return simulate_world(situation, *reconstruct(situation))
+
+
+@pytest.mark.parametrize("way", [{"along_arrow": True}, {"cue": "trail"}, {"forward": True}, {"towards": "vase"}])
+def test_what_is_missing_is_told_in_the_same_words_whoever_said_it(way: dict[str, Any]) -> None:
+    """The question is "?": nothing can be said of what it speaks of."""
+    with refused("cannot-read-direction") as caught:
+        read(None, **way)
+    assert "question" not in caught.value.detail
 
 
 @pytest.mark.parametrize("law", ["contact", "ballistic"])
@@ -101,6 +118,35 @@ def test_speeds_as_they_are_said_by_readers_and_callers(speed: Any, pixels: floa
 @pytest.mark.parametrize(("distance", "pixels"), [(60, 60), ({"value": 0.3, "unit": "m"}, 0.3 * 640 / 3)])
 def test_distances_have_units(distance: Any, pixels: float) -> None:
     assert read(None, direction=(1, 0), distance=distance).value.distance == pytest.approx(pixels)
+
+
+def test_a_goal_is_found_by_what_describes_it_and_reported() -> None:
+    for name in ("blue block", "the big blue block"):
+        found = read(None, towards=name, others=[{"object": "blue block", "towards": "the ball"}]).value
+        assert found.towards == OTHER
+        assert found.direction == pytest.approx((1, 0), abs=0.1)
+        (other,) = found.others
+        assert (other.towards and other.towards.bbox, other.direction) == (BALL, pytest.approx((-1, 0), abs=0.1))
+    with refused("cannot-read-direction"):
+        read(None, towards="ball")
+    with refused("invalid-request", "/motion/others/0/towards"):
+        read(None, direction=(1, 0), others=[{"object": "blue block", "towards": "block"}])
+
+
+def test_a_reading_has_every_field_of_the_motion() -> None:
+    """All but those that its direction stands for."""
+    step = {"direction": (-1.0, 0.0), "depth": 0.1, "distance": 30.0, "duration": 2.0}
+    way = {"direction": (0.6, 0.8), "direction_deviation": 5.0, "depth": 0.2, "speed": 50.0, "speed_deviation": 0.1}
+    said = {
+        "kind": "linear", "law": "ballistic", **way, "other_direction": (0.0, 1.0), "cue": "arrow", "rises": True,
+        "distance": 60.0, "duration": 3.0, "until": "contact", "steps": (step,), "metres_per_pixel": 0.004,
+        "others": ({"object": "Blue block", "kind": "projectile", **way},), "depth_deviation": 3.0, "down": (0.6, 0.8),
+    }  # fmt: skip
+    carried = reading_of(GROUNDING, read(None, **said).value).motion
+    assert carried is not None
+    assert carried.model_dump(include=said.keys(), exclude={"others": {"__all__": {"towards"}}}) == said
+    assert MotionRequest.model_fields.keys() - said.keys() == {"towards", "along_arrow", "forward"}
+    assert OtherMotionRequest.model_fields.keys() - said["others"][0].keys() == {"towards"}
 
 
 def test_a_throw_has_no_length() -> None:

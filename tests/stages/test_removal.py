@@ -15,6 +15,7 @@ from staged import BLUE, GREEN, RED, YELLOW, VideoModel, clip_of, computed, pixe
 from cow_service.generators.cutout import create
 from cow_service.media.types import Image
 from cow_service.physics.ensemble import run_ensemble
+from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.settings import Settings
 from cow_service.stages.grounding import ground, look_again
 from cow_service.stages.motion import settle_motion
@@ -43,12 +44,12 @@ def off_bare(image: Image) -> float:
     return float(np.abs(image[THERE].astype(int) - picture(with_block=False)[THERE].astype(int)).mean())
 
 
-def run(interventions=REMOVE, objects=ALL, generator: Any = None, **request: Any) -> Run:
+def run(interventions: Any = REMOVE, objects=ALL, generator: Any = None, **request: Any) -> Run:
     motion = {"kind": "linear", "direction": (1, 0), "speed": 200}
     asked = {"question": QUESTION, "num_frames": 49, "ensemble": 15} | request
     given = {"grounding": {"object": "red ball", "bbox": MOVER}, "motion": motion, "objects": objects}
     made_by = generator or create(Settings())
-    return run_of(picture(), generator=lambda: made_by, **given, interventions=interventions, **asked)
+    return run_of(picture(), generator=lambda: made_by, **given | {"interventions": interventions} | asked)
 
 
 def test_without_it_the_mover_gets_to_what_is_behind_it() -> None:
@@ -122,11 +123,19 @@ def test_what_cannot_be_done_is_refused(interventions: Any, pointer: str) -> Non
 
 def test_the_question_says_it_of_objects_that_are_given() -> None:
     question = "If the green block is removed and the red ball rolls right, will it hit the cube?"
-    for said in ((), REMOVE):
+    for said in (None, REMOVE):
         (removed,) = ground(run(interventions=said, question=question)).value.interventions
         assert (removed.kind, removed.object.object, removed.object.bbox) == ("remove", "Green  block", BETWEEN)
     with refused("invalid-request", "/objects"):
-        ground(run(interventions=(), objects=ALL[:1], question=question))
+        ground(run(interventions=None, objects=ALL[:1], question=question))
+
+
+@pytest.mark.parametrize("is_located", [True, False], ids=["the words say it", "the reader says it"])
+def test_an_empty_list_takes_nothing_away_whatever_the_question_says(is_located: bool) -> None:
+    question = "If the green block is removed and the red ball rolls right, will it hit the blue cube?"
+    given = {} if is_located else {"grounding": None, "motion": None, "objects": (), "reader": EmbeddedReader}
+    assert len(ground(run(interventions=None, question=question, **given)).value.interventions) == 1
+    assert ground(run(interventions=(), question=question, **given)).value.interventions == ()
 
 
 class TestFrames:

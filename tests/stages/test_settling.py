@@ -76,6 +76,7 @@ UP = (0.0, -1.0)
 AWAY = MotionRequest(direction=UP, depth=0.87)
 FORWARD, BACKWARD = MotionRequest(forward=True), MotionRequest(forward=False)
 TOWARDS, AT_VASE = MotionRequest(towards="vase"), SeenWay(goal=VASE)
+AT_IT: dict[str, Any] = {"direction": None, "towards": "vase"}
 RULES = {
     "what is not estimated stays": Rule(RIGHT, "orientation", {"direction_deviation": None}, seen=SeenWay(DOWN)),
     "nothing else tells": Rule(RIGHT, "orientation"),
@@ -94,6 +95,7 @@ RULES = {
         RIGHT, "arrow", BY_ARROW, TOWARDS, SeenWay(RIGHT, goal=VASE), rival=DOWN
     ),
     "towards a thing": Rule(DOWN, "text", {"direction": DOWN}, TOWARDS, AT_VASE),
+    "towards a thing that only the reader names": Rule(DOWN, "text", AT_IT, seen=AT_VASE),
     "towards a thing elsewhere": Rule(DOWN, "text", {}, TOWARDS, AT_VASE, rival=RIGHT),
     "as it faces": Rule(DOWN, "orientation", {"direction": turned(60)}, FORWARD, SeenWay(front=DOWN)),
     "backward from its front": Rule(UP, "orientation", {"direction": UP}, BACKWARD, SeenWay(front=DOWN)),
@@ -120,7 +122,8 @@ def test_the_surest_source_decides(rule: Rule) -> None:
     assert rule.rival is None or angle(settled.other_direction or RIGHT, rule.rival) < 1e-6
     is_estimate = settled is read
     assert settled.direction_deviation in (None, read.direction_deviation)
-    assert (settled.towards == "vase") is (rule.said is TOWARDS and rule.rival is None)
+    is_named = rule.said is TOWARDS or rule.read is AT_IT
+    assert (settled.towards == "vase") is (is_named and rule.rival is None)
     assert is_estimate or settled.depth == pytest.approx(0.0 if not rule.said.depth else 0.87, abs=0.01)
 
 

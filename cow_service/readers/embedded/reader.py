@@ -103,7 +103,7 @@ class EmbeddedReader:
         self, given: base.ReaderInput, question: Question, mover: ObjectPhrase
     ) -> tuple[Observation, base.ReadResult]:
         """Where the things are, and what is changed and asked; with trails that end as is said."""
-        changes = () if given.given.interventions else question.changes
+        changes = question.changes if given.given.interventions is None else ()
         _check_changes(question, changes)
         observation, warnings = motions.with_trail_as_said(given.seen, question)
         if given.find is not None and observation.side_view is None:
@@ -111,7 +111,7 @@ class EmbeddedReader:
         finder = _Finder(observation, given.known)
         bbox, changed = finder.changed(changes, mover, question.names_arrow)
         named, things, unclear = finder.others(question, given, bbox)
-        is_told = given.given.asked is None or not given.given.interventions
+        is_told = given.given.asked is None or given.given.interventions is None
         doubts, doubtful = matching.noun_doubts(observation, [*named, *([] if mover.is_given else [(mover, bbox)])])
         left = question.unread if is_told else ()
         own = finder.known.get(mover.text) or records.GroundingRequest()

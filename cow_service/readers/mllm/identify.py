@@ -289,7 +289,7 @@ NOTHING_IDENTIFIED = Identified.model_construct(object="", others=(), asked=None
 
 def identified_by_words(given: ReaderInput) -> Identified | None:
     """What the words of a question say of all that is asked here; None where they leave something open."""
-    words, is_changed = given.words, bool(given.given.interventions)
+    words, is_changed = given.words, given.given.interventions is not None
     if words is None or not words.is_whole or words.reading.grounding is None or words.reading.motion is None:
         return None
     read = words.reading
@@ -298,7 +298,7 @@ def identified_by_words(given: ReaderInput) -> Identified | None:
         others=tuple(each.object for each in read.objects),
         asked=read.asked if given.given.asked is None else None,
         kind=words.reading.motion.kind,
-        changes=tuple(Change.model_construct(**dict(each)) for each in read.interventions if not is_changed),
+        changes=tuple(Change.model_construct(**dict(each)) for each in read.interventions or () if not is_changed),
     )
 
 
@@ -311,7 +311,7 @@ def identify_call(given: ReaderInput, image: EncodedImage, reasoning_length: int
     is_placed = place is not None and place.bbox is not None  # then all but the motion is known
     if is_placed or asked is not None or given.given.asked is not None:
         said.add("asked")
-    if is_placed or given.given.interventions:
+    if is_placed or given.given.interventions is not None:
         said.add("changes")
     if not given.motion_wanted:
         said.update(_MOTION)

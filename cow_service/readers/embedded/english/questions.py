@@ -33,9 +33,7 @@ class MotionWords:
     verb: str = ""
     towards: lex.ObjectPhrase | None = None
     trail: bool = False  # on along it
-    trail_end: lex.ObjectPhrase | Vector | None = (
-        None  # the thing, or the side, that its present position is nearest to
-    )
+    trail_end: lex.ObjectPhrase | Vector | None = None  # the thing, or the side, to which it is nearest now
     quantities: tuple[lex.QuantityWords, ...] = ()
     steps: "tuple[MotionWords, ...]" = ()  # the legs behind the first
     others: "tuple[tuple[lex.ObjectPhrase, MotionWords], ...]" = ()  # what moves at the same time
@@ -210,45 +208,48 @@ class _Parser:
 
     def question(self) -> Question:
         """What all pieces together say."""
-        asks, stated = ([each for each in self.pieces if each.what == what] for what in ("asked", "stated"))
-        last = max((at for at, token in enumerate(self.plain[:-1]) if token in {".", "?"}), default=0)
-        is_terse = not asks and stated and stated[-1].start >= last and self.plain[-1] not in {".", "!"}
-        asking = asks[0] if asks else stated[-1] if is_terse or (stated and "CLAIM" in self.plain) else None
-        self.told = [each for each in stated if each is not asking]
-        self.changes = changes = self._changes(asking)
-        put = next((each.object for each in changes if each.kind == "place"), None)
+        asks = [each for each in self.pieces if each.what == "asked"]
+        asking = asks[0] if asks else self._claim()
+        self.told = [each for each in self.pieces if each.what == "stated" and each is not asking]
+        self.changes = self._changes(asking)
         moving = self._moving(asking)
-        acts = "" if asking is None else asking.thing("s")
-        self.mover = next(iter(moving), self._token(put) if put else acts)
-        first = next(iter(moving.values()), NOT_SAID)
-        if put is not None and (not moving or first.kind == "static"):
-            self.mover, first = self._token(put), MotionWords("place", verb="put")
-        unread = self._unread(asking, [each for each in asks if each is not asking])
-        asked, alternatives = (None, ()) if asking is None else self._asked(asking)
-        if asking is not None and asked is None:
-            unread.append(("asked", " ".join(word for word in self.said[asking.start : asking.end] if word)))
-        if asking is None and moving:
-            asked = Asked(form="what-happens", relation="touches")  # "Push the red ball to the right."
-        gone, phrases = [each.object for each in changes if each.kind == "remove"], [*map(self._thing, self._named())]
-        named = next((each for each in phrases if each not in gone and asking is None), None)
-        mover = self._thing(self.mover) if self.mover else named
+        put = next((each.object for each in self.changes if each.kind == "place"), None)
+        self.mover, motion = next(iter(moving.items()), ("" if asking is None else asking.thing("s"), NOT_SAID))
+        if put is not None and (not moving or motion.kind == "static"):
+            self.mover, motion = self._token(put), MotionWords("place", verb="put")
+        unread = self._unread(asking, asks[1:])
+        if asking is None:  # "Push the red ball to the right."
+            asked = Asked(form="what-happens", relation="touches") if moving else None
+        elif (asked := self._asked(asking)) is None:
+            unread.append(("asked", " ".join(filter(None, self.said[asking.start : asking.end]))))
+        gone = [each.object for each in self.changes if each.kind == "remove"]
+        phrases = [*map(self._thing, self._named())]
+        left = (each for each in phrases if each not in gone and asking is None)
+        mover = self._thing(self.mover) if self.mover else next(left, None)
         if asked is not None and asked.form == "which-to-remove":
-            phrases += [each for each in map(parse_noun_phrase, asked.among) if each is not None]
-        others = {plain(each.text): each for each in reversed(phrases) if each.head != "container"}
-        further = tuple((self._thing(each), motion) for each, motion in moving.items() if each != self.mover)
+            phrases += filter(None, map(parse_noun_phrase, asked.among))
+        named = {plain(each.text): each for each in reversed(phrases) if each.head != "container"}
+        further = tuple((self._thing(each), way) for each, way in moving.items() if each != self.mover)
         return Question(
             mover=mover,
-            motion=replace(first, others=further),
-            says_motion=bool(moving) or first != NOT_SAID,
-            changes=changes,
+            motion=replace(motion, others=further),
+            says_motion=bool(moving) or motion != NOT_SAID,
+            changes=self.changes,
             asked=None if unread else asked,
-            others=tuple(each for each in reversed(others.values()) if each not in (mover, *gone)),
-            alternatives=alternatives,
+            others=tuple(each for each in reversed(named.values()) if each not in (mover, *gone)),
+            alternatives=tuple(self._among(asking)) if asking and asked and asked.form == "which-first" else (),
             names_arrow=any(word in {"ALONG", "AGAINST"} or "arrow" in word for word in (*self.plain, *self.said)),
             names_direction=not _DIRECTIONS.isdisjoint(self.plain),
             unread=tuple(dict.fromkeys(said for _, said in unread)),
             unread_motion=tuple(dict.fromkeys(said for what, said in unread if what == "motion")),
         )
+
+    def _claim(self) -> _Piece | None:
+        """The statement that stands for a question, as in "True or false: the ball hits the mug"."""
+        stated = [each for each in self.pieces if each.what == "stated"]
+        last = max((at for at, token in enumerate(self.plain[:-1]) if token in {".", "?"}), default=0)
+        is_terse = stated and stated[-1].start >= last and self.plain[-1] not in {".", "!"}
+        return stated[-1] if is_terse or (stated and "CLAIM" in self.plain) else None
 
     def _thing(self, token: str) -> lex.ObjectPhrase:
         return self.tokens.things[int(token[1:])]
@@ -326,44 +327,23 @@ class _Parser:
         named = [each for each in self.plain[:at] if _THING.fullmatch(each) and each != subject]
         return named[-1] if named and token in {"it", "that", "this"} else None
 
-    def _asked(self, asking: _Piece) -> tuple[Asked | None, tuple[lex.ObjectPhrase, ...]]:
-        """What is asked, and among which things; None where that is not clear."""
+    def _asked(self, asking: _Piece) -> Asked | None:
+        """What is asked; None where that is not clear."""
         form, relation, is_negated = asking.form.asks
         is_turned, counts = "n" in asking.roles or asking.said("q") == "NOOF", asking.said("q")
-        target = self._target(asking)
+        target, among = self._target(asking), [] if form == "which-first" else self._among(asking)
         unclear = is_turned and (is_negated or counts == "ALLOF")
         if target is None or unclear or (asking.said("o") == "EVERYTHING" and not is_negated):
-            return None, ()
-        subject = asking.thing("s") or self.mover
-        relation, doer, target = self._turned(asking, relation, subject if subject != self.mover else "", target)
-        thing, words = self._thing(target) if target else None, self.plain[asking.start : asking.end]
-        if relation == "lands" and thing is not None:  # "off the table"
-            if thing.head in lex.TABLES:
-                thing = None
-            elif {"off", "on"}.isdisjoint(words):
-                return None, ()
-        if relation == "inside" and form == "whether":
-            puts = [each.targets[0] for each in self.changes if each.targets]
-            thing = thing or next(iter(puts), None)
-            if thing is None:
-                return None, ()
-            along = not {"roll", "slide", "move", "drive", "push"}.isdisjoint(words)
-            holds = thing.head in (lex.SETS["hollow"] if along else lex.CONTAINERS)
-            relation = "inside" if holds or "fit" in words or self.changes else "touches"
-        crash = [each.thing("o") for each in self.told if each.thing("o")]
-        if (form == "which-to-remove" or asking.said("r")) and thing is None and crash:
-            thing = self._thing(crash[-1])  # "It will collide with the lamp. Which object should be removed ..."
-        lists = [each.said("l") for each in (asking, *self.pieces) if each.said("l")]
-        listed, kinds = self._phrases(lists[0]) if lists else [], self._phrases(asking.said("k"))
-        among = {"whether": self._phrases(asking.said("a")), "how-many": kinds, "which": listed}.get(form, [])
-        if form == "which-to-remove":
-            options = [parse_noun_phrase(text) for text in self.options]
-            among = listed or ([each for each in options if each is not None] if all(options) else [])
-        names_one = form in {"whether", "when", "what-happens", "which-to-remove"}
+            return None
+        relation, doer, target = self._turned(asking, relation, target)
+        meant = self._meant(asking, relation, self._thing(target) if target else None)
         within = min((each.value for each in self.tokens.quantities if each.what == "within"), default=None)
-        if len(among) > records.MAX_OBJECTS or (within is not None and not 0 < within <= records.MAX_WITHIN):
-            return None, ()
-        asked = Asked(
+        is_endless = within is not None and not 0 < within <= records.MAX_WITHIN
+        if meant is None or is_endless or len(among) > records.MAX_OBJECTS:
+            return None
+        relation, thing = meant
+        names_one = form in {"whether", "when", "what-happens", "which-to-remove"}
+        return Asked(
             form=form,
             relation=relation,
             subject=self._thing(doer).text if doer and form != "which-to-remove" else None,
@@ -374,7 +354,36 @@ class _Parser:
             partly=relation in {"covers", "covered"} and not {"PARTLY", "SOMETIME"}.isdisjoint(self.plain),
             within=within,
         )
-        return asked, tuple(listed or kinds) if form == "which-first" else ()
+
+    def _meant(
+        self, asking: _Piece, relation: AskedRelation, thing: lex.ObjectPhrase | None
+    ) -> tuple[AskedRelation, lex.ObjectPhrase | None] | None:
+        """The relation and the thing as they are meant; None where that is not clear."""
+        form, words = asking.form.asks[0], self.plain[asking.start : asking.end]
+        if relation == "lands" and thing is not None:  # "off the table"
+            if thing.head not in lex.TABLES and {"off", "on"}.isdisjoint(words):
+                return None
+            thing = None if thing.head in lex.TABLES else thing
+        if relation == "inside" and form == "whether":
+            thing = thing or next((each.targets[0] for each in self.changes if each.targets), None)
+            if thing is None:
+                return None
+            along = not {"roll", "slide", "move", "drive", "push"}.isdisjoint(words)
+            holds = thing.head in (lex.SETS["hollow"] if along else lex.CONTAINERS)
+            relation = "inside" if holds or "fit" in words or self.changes else "touches"
+        crash = [each.thing("o") for each in self.told if each.thing("o")]
+        if (form == "which-to-remove" or asking.said("r")) and thing is None and crash:
+            thing = self._thing(crash[-1])  # "It will collide with the lamp. Which object should be removed ..."
+        return relation, thing
+
+    def _among(self, asking: _Piece) -> list[lex.ObjectPhrase]:
+        """The things among which the question asks for some: those that it lists, or that its options name."""
+        kinds, options = self._phrases(asking.said("k")), [*filter(None, map(parse_noun_phrase, self.options))]
+        listed = self._phrases(next(filter(None, (each.said("l") for each in (asking, *self.pieces))), ""))
+        named = listed or (options if len(options) == len(self.options) else [])
+        by_form = {"whether": self._phrases(asking.said("a")), "how-many": kinds, "which": listed}
+        by_form |= {"which-first": listed or kinds, "which-to-remove": named}
+        return by_form.get(asking.form.asks[0], [])
 
     def _target(self, asking: _Piece) -> str | None:
         """The thing that is acted on; empty for any, None where it is not clear which."""
@@ -393,10 +402,9 @@ class _Parser:
             return ""
         return self.mover if asking.is_passive and said == "it" else self._resolved(said, asking.start, subject)
 
-    def _turned(
-        self, asking: _Piece, relation: AskedRelation, doer: str, target: str
-    ) -> tuple[AskedRelation, str, str]:
+    def _turned(self, asking: _Piece, relation: AskedRelation, target: str) -> tuple[AskedRelation, str, str]:
         """Relation, what acts (empty for the mover) and what it acts on, as the record words them: of the mover."""
+        doer = "" if asking.thing("s") == self.mover else asking.thing("s")
         passive, own = asking.is_passive, target == self.mover
         if relation == "covers" and target:
             if own and (doer or passive):  # "the vase hides it", "is it hidden by the vase?"
