@@ -104,8 +104,6 @@ VARIANTS: dict[str, tuple[Patch, ...]] = {
     "side view": (("perception.observation:find_side_view", nothing),),
     "segments": (("perception.observation:find_segments", no_lines),),
     "discs": (("perception.classical.regions:as_disc", nothing),),
-    "undersides": (("perception.classical.regions:_with_undersides", list),),
-    "rims": (("perception.classical.regions:_without_rim", first),),
     "hidden": (("perception.classical.regions:_hidden", seen_whole),),
     "white sides": (("perception.classical.regions:white_sides", empty),),
     "black faces": (("perception.classical.regions:black_faces", second),),

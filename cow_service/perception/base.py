@@ -62,10 +62,6 @@ class Thing:
         return (self.bbox[0] + self.bbox[2]) / 2, (self.bbox[1] + self.bbox[3]) / 2
 
 
-Find = Callable[[Image, Sequence[str]], tuple[Thing, ...]]
-"""Finds things in an image without drawings on it: those of some names, or whatever stands there if it knows none."""
-
-
 @dataclass(frozen=True)
 class Prompt:
     """Where a thing is: a point on it, or a box around it."""

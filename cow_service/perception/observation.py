@@ -382,14 +382,14 @@ class Sight:
     def look_closer(
         self,
         mover: BBox,
-        others: Sequence[BBox],
+        others: tuple[BBox, ...],
         trails: bool,
         masks: tuple[tuple[BBox, str], ...],
         read: Callable[[str], bytes],
     ) -> Observation:
         """What it shows once it is known what moves: neither that nor the other things are annotations, and where
         trails are spoken of, one ends at the mover. `masks` that were stored are read by their digests."""
-        key = mover, tuple(others), trails, masks
+        key = mover, others, trails, masks
         if key not in self._closer:
             known = {bbox: CroppedMask.of(decode_own_mask(read(digest))) for bbox, digest in masks}
             self._closer[key] = self.look(trails).with_masks(known).keeping((mover, *others)).with_mover(mover)

@@ -520,11 +520,7 @@ def motion_sentence(motion: Motion, grounding: Grounding, towards: str | None = 
 
 
 def along_trail(
-    run: Run[SimulateRequest],
-    grounding: Grounding,
-    motion: Motion,
-    depth: EstimatedDepth | None,
-    speed_given: bool,
+    run: Run[SimulateRequest], grounding: Grounding, motion: Motion, depth: EstimatedDepth | None, speed_given: bool
 ) -> Motion:
     """A motion read from a trail, with speed, direction and depth as the trail at the mover measures them."""
     observation = look_again(run, grounding, motion.cue)

@@ -188,9 +188,8 @@ def outlined_box(
 
 def find_things(run: Run[SimulateRequest], observation: Observation, names: Sequence[str]) -> tuple[Thing, ...]:
     """What the models of the server find by some names. To be called with `cpu` held."""
-    detector = run.backends.perception.detector
+    detector, embedded = run.backends.perception.detector, _embedded(run, observation) if run.can_segment else None
     assert detector is not None, "asked for only where there is a detector"
-    embedded = _embedded(run, observation) if run.can_segment else None
     return find_named(detector, embedded, observation.undrawn, names)
 
 

@@ -159,9 +159,9 @@ class Run(Generic[Request_co]):
 
         Masks are those that were stored: one that is cut again from its box may differ from what was given.
         """
-        read = self.backends.artifacts.read
-        things = [(each.bbox, each.mask.sha256) for each in (mover, *others) if each.mask is not None]
-        return self.sight.look_closer(mover.bbox, [each.bbox for each in others], trails, tuple(things), read)
+        masks = tuple((each.bbox, each.mask.sha256) for each in (mover, *others) if each.mask is not None)
+        boxes, read = tuple(each.bbox for each in others), self.backends.artifacts.read
+        return self.sight.look_closer(mover.bbox, boxes, trails, masks, read)
 
     @property
     def can_segment(self) -> bool:

@@ -88,7 +88,11 @@ CASES: dict[str, tuple[dict[str, Any], Trajectory, list[str]]] = {
     ))), ["'mug' makes room for what is put there, so it does not start where the image shows it."]),
     "a depth map that shows it all": (MAP | {"camera": {"pitch": 23}}, world(**MEASURED), []),
     "a depth map without a camera": (MAP, world(**measured(floor=None) | {"camera": None}), []),
-    "no depth map was given": ({}, world(**measured(floor=None)), []),
+    "no depth map was given": ({}, world(camera=MEASURED["camera"]), []),
+    "a depth map of the server without a floor": ({}, world(**measured(floor=None, source="model")), [
+        "The depth map shows no floor for things to stand on, so there is no answer from it. Give a map as `depth`, or "
+        "another picture."
+    ]),
     "a depth map that was not used": (MAP, world(camera=MEASURED["camera"]), [
         "The depth map was not used: the path was given, or the law is `ballistic`."
     ]),

@@ -6,7 +6,7 @@ hue, are left out. Where the surroundings vary too much (most photographs), no r
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -57,8 +57,6 @@ class RegionRules(NamedTuple):
     own_width: float = 0.55  # of the narrowest colour: black narrower than this is a neck or a wheel
     mask_sigma: float = 0.8  # px at the working size, smooths the stairs of an enlarged mask
     disc: float = 0.93  # roundness from which a drawn shape is a disc
-    rim: int = 11  # px: by a square of this width a ball is grown: what is thinner than `_DISC` there is its rim
-    dark: float = 28.0  # lightness below which a part may be the underside of another
     sure_contrast: float = 20.0  # Lab units: from here on contrast takes nothing from the confidence
     sure_area: float = 300.0  # px at the working size, from which the size takes nothing
 
@@ -113,9 +111,6 @@ def find_regions(image: Image, names: Sequence[str] = ()) -> tuple[Thing, ...]:
             whole[window] = shape
             confidence = _confidence(near, shape, border[window], disc is not None)
             found.append(_Found(whole, near.lab[part], confidence, disc is not None))
-    found = _with_undersides(found)
-    balls = np.logical_or.reduce([border & False, *(one.mask for one in found if one.is_disc)])
-    found = [_without_rim(one, balls) for one in found]
     pairs = zip(found, _hidden(found), strict=True)
     regions = [one.region((height, width), is_hidden) for one, is_hidden in pairs]
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[: REGION.most])
@@ -281,13 +276,6 @@ def _coloured_parts(view: View, component: Mask) -> list[Mask]:
     return parts
 
 
-def _without_rim(one: _Found, balls: Mask) -> _Found:
-    """Without the rim around balls [h, w], where their colour mixes with the floor's: a pale table's is like that."""
-    broad = cv2.morphologyEx(one.mask.astype(np.uint8), cv2.MORPH_OPEN, _DISC) > 0
-    kept = one.mask & (broad | ~masks.dilated(balls, REGION.rim))
-    return one if one.is_disc or 2 * kept.sum() < one.mask.sum() else replace(one, mask=kept)
-
-
 def _hidden(found: Sequence[_Found]) -> list[bool]:
     """Which of them have much of their outline along one thing of another colour that ends lower in the image."""
     things = [
@@ -328,24 +316,6 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
     if is_disc:
         sharp, contrast, size = max(sharp, 0.9), 1.0, 2 * size
     return sharp * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
-
-
-def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
-    """Joins dark lower ends, such as a car's wheels with the shade between them, with what they carry."""
-    dark, whole = list[_Found](), list[_Found]()
-    for one in found:
-        lightness, a, b = np.median(one.lab, axis=0).tolist()
-        is_dark = lightness < REGION.dark and colour_name(lightness, a, b) in {"black", "brown"}
-        (dark if is_dark and not one.is_disc else whole).append(one)
-    for part in dark:
-        box, near = masks.bbox_of(part.mask), masks.dilated(part.mask)
-        touched = [i for i, one in enumerate(whole) if (one.mask & near).any()]
-        match [i for i in touched if is_underside(box, masks.bbox_of(whole[i].mask))]:
-            case [i]:
-                whole[i] = replace(whole[i], mask=whole[i].mask | part.mask)
-            case _:
-                whole.append(part)
-    return whole
 
 
 def _names(lab: Floats32) -> tuple[str, frozenset[str]]:
