@@ -59,6 +59,15 @@ def test_a_link_to_a_job_opens_the_same_view_and_one_to_no_job_says_so(served: S
     assert_fits(page)
 
 
+def test_a_request_that_changes_nothing_is_asked_again_as_it_was(served: Served, windows: Windows) -> None:
+    job = asked(served, interventions=[])
+    page = windows.open(address(served, f"/?job={job['id']}"))
+    assert result(page) == job["id"]
+    with page.expect_request(lambda request: request.method == "POST" and request.url.endswith("/answer")) as sent:
+        ask(page, QUESTION)
+    assert sent.value.post_data_json["interventions"] == []
+
+
 def test_cancel_ends_the_job(served: Served, windows: Windows) -> None:
     job = served.submit(slow(60))
     page = windows.open(address(served, f"/?job={job['id']}"))

@@ -44,6 +44,7 @@ export function stateOf(kind, { question, image, options, baseline, live, ...req
   const corrections = {};
   for (const name of CORRECTED) corrections[name] = request[name] ?? null;
   for (const name of LISTS) corrections[name] = request[name] ?? [];
+  if (request.interventions?.length === 0) settings.rest.interventions = []; // nothing is changed, whatever the question says
   for (const [name, value] of Object.entries(request)) {
     if (SETTINGS.includes(name)) settings[name] = value;
     else if (!(name in corrections)) settings.rest[name] = value; // what the page has no field for
