@@ -28,14 +28,13 @@ import numpy as np
 
 from cow_service.media.masks import CroppedMask
 from cow_service.media.types import Floats
-from cow_service.physics.bodies import SeenBody
+from cow_service.physics.bodies import SeenBody, Shadow
 from cow_service.physics.camera import CameraFit, FloorCamera, fit_shadow, prior
 from cow_service.physics.draws import ensemble, likeliest
 from cow_service.physics.engine import RigidShape, run_worlds
 from cow_service.physics.ensemble import SURE
 from cow_service.physics.events import find_world_events
 from cow_service.physics.lift import DIRECTION_DEVIATIONS
-from cow_service.physics.seen import Shadow
 from cow_service.physics.world import WorldInput, run_world
 from cow_service.records import BBox, MetresPerPixel, Motion, MotionRequest, Shape
 from cow_service.stages.motion import SPEED_DEVIATIONS, THROW_DEPTH_DEVIATION, Units

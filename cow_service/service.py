@@ -18,7 +18,7 @@ from cow_service.media.artifacts import ArtifactStore, DiskArtifacts, RetryPolic
 from cow_service.media.images import check, decode, decode_data_url
 from cow_service.net import ImageUrls
 from cow_service.observability.metrics import Metrics
-from cow_service.perception.base import Perception
+from cow_service.perception.base import GROUPS, Perception
 from cow_service.perception.observation import SeenImages
 from cow_service.pipeline import answer, simulate
 from cow_service.readers.base import Reader, WordReader
@@ -53,11 +53,11 @@ class Service:
         self.cpu = PrioritySemaphore(settings.concurrency)  # held around work on the CPU
         self._devices: dict[str, PrioritySemaphore] = {}  # of generators with a limit of simultaneous clips
         self._guard = Lock()
-        self.seen = SeenImages()  # what jobs have measured in images, for those that come with the same
         self.metrics = Metrics()
         self.image_urls = ImageUrls(settings)
         self.artifacts = open_artifact_store(settings)
         self.perception = Perception(settings)
+        self.seen = SeenImages(self.perception)  # what jobs have seen in images, for those that come with the same
         self.readers: Registry[Reader] = Registry("cow_service.readers", errors.ReaderUnavailable, settings)
         self._generator_limits = {point.name: point for point in entry_points(group="cow_service.generator_limits")}
         self.generators: Registry[Generator] = Registry("cow_service.generators", errors.GeneratorUnavailable, settings)
@@ -222,7 +222,7 @@ class Service:
         nouns = words.read_question(request.question).nouns if request.question is not None else ()
         most = self.settings.max_image_megapixels
         with self.cpu.held(runs.priority_of(0, runs.now()), lambda: None):
-            return look(self.perception, key, image, request, nouns, most)
+            return look(self.perception, self.seen, key, image, request, nouns, most)
 
     def load(self) -> WorkerLoad:
         """What its work waits for just now."""
@@ -308,11 +308,12 @@ class Service:
         modules = manifest.missing_modules()
         unset = tuple(name for name in manifest.settings if not self.settings.has(name))
         here = ready(manifest, self.settings.weights_dir, without=self.settings.own_parts(name))
+        sees = kind not in GROUPS or self.settings.role != "api"  # which looks at no picture itself
         return BackendInfo(
             name=name,
             kind=kind,
             default=default,
-            ready=here and not modules and not unset,
+            ready=here and sees and not modules and not unset,
             needs=manifest.modules,
             summary=manifest.summary,
             licence=manifest.licence,

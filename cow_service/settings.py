@@ -99,8 +99,9 @@ class Settings(BaseSettings):
     """Default reader, the part that understands the question; `mllm` where COW_MLLM is set."""
     generator: str = "cutout"
     """Default generator, the part that makes the frames."""
-    perception: str = Field(default="none", min_length=1)
-    """Vision models: none, cpu, gpu, or comma-separated names of `cow models`, at most one of each kind."""
+    perception: str = Field(default="eye", min_length=1)
+    """Vision models: eye, cpu, gpu, or comma-separated names of `cow models`, at most one of each kind. The small
+    network `eye` sees beside all of them; none, alone, turns it off."""
     max_image_megapixels: float = Field(default=25, gt=0, le=500)
     """Largest image accepted, in millions of pixels."""
     max_body_mb: float = Field(default=32, gt=0, le=4096)

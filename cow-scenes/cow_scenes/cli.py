@@ -1,4 +1,4 @@
-"""The command `cow-scenes`: make, check, pack. Code 2 and one line for bad arguments, 1 for what failed."""
+"""The command `cow-scenes`: make, check, pack, eye. Code 2 and one line for bad arguments, 1 for what failed."""
 
 import sys
 from pathlib import Path
@@ -11,6 +11,7 @@ from rich.text import Text
 
 from .check import check_set
 from .errors import CheckError, ScenesError, UsageError
+from .eye.commands import app as eye
 from .make import make_set, missing
 from .pack import pack_set
 from .plan import FAMILIES, LEVELS, TASKS
@@ -18,6 +19,7 @@ from .pool import Failed
 from .settings import Settings
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help=__doc__, pretty_exceptions_enable=False)
+app.add_typer(eye, name="eye")
 DEFAULT = Settings()
 ArgumentError: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 """The base of typer's argument errors; where its module is differs between versions of typer."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:  # they need OpenCV, which a machine for video models may lack
     from cow_service.media.masks import CroppedMask
     from cow_service.perception.base import Inpainter
     from cow_service.perception.observation import Obstacle
-    from cow_service.physics.seen import Shadow
+    from cow_service.physics.bodies import Shadow
 
 
 @dataclass(frozen=True, eq=False)

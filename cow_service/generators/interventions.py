@@ -115,7 +115,7 @@ def with_put(given: GeneratorInput, factual: Trajectory) -> GeneratorInput:
         if path.body:
             obstacles[path.body - 1] = replace(obstacles[path.body - 1], bbox=bbox, mask=mask)
         else:
-            changed = replace(changed, mover=mask)
+            changed = replace(changed, mover=mask, shadow=None)
             grounding = grounding.model_copy(update={"bbox": bbox, "point": path.points[1]})
     return replace(given, scene=changed, obstacles=tuple(obstacles), grounding=grounding, before=before)
 

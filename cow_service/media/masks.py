@@ -176,6 +176,21 @@ class CroppedMask:
         """How many pixels it shares with a mask [H, W]."""
         return int(np.count_nonzero(self.patch & mask[self.rows, self.columns]))
 
+    def overlap(self, other: CroppedMask) -> int:
+        """How many pixels it shares with another mask of the same image."""
+        rows = slice(max(self.rows.start, other.rows.start), min(self.rows.stop, other.rows.stop))
+        columns = slice(max(self.columns.start, other.columns.start), min(self.columns.stop, other.columns.stop))
+        if rows.start >= rows.stop or columns.start >= columns.stop:
+            return 0
+        own, its = (
+            one.patch[
+                rows.start - one.rows.start : rows.stop - one.rows.start,
+                columns.start - one.columns.start : columns.stop - one.columns.start,
+            ]
+            for one in (self, other)
+        )
+        return int(np.count_nonzero(own & its))
+
     def contains(self, x: int, y: int) -> bool:
         """Whether a pixel of the image is set."""
         inside = self.rows.start <= y < self.rows.stop and self.columns.start <= x < self.columns.stop

@@ -122,7 +122,7 @@ def warnings_of_outlines(trajectory: Trajectory) -> list[str]:
 
 
 def _of_depth(request: SimulateRequest, grounding: Grounding, trajectory: Trajectory) -> list[str]:
-    """What a caller should know of how the depth map of a request was used, in sentences."""
+    """What a caller should know of how the depth map was used, in sentences."""
     camera, depth = trajectory.camera, trajectory.depth
     if camera is None or (depth is None and request.depth is None):
         return []

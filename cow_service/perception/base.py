@@ -21,8 +21,9 @@ from cow_service.registry import Registry
 from cow_service.settings import Settings, SettingsError
 from cow_service.weights.manifests import check_modules
 
-PerceptionKind = Literal["segmenter", "detector", "depth", "inpainter"]
+PerceptionKind = Literal["finder", "segmenter", "detector", "depth", "inpainter"]
 GROUPS: dict[PerceptionKind, str] = {
+    "finder": "cow_service.finders",
     "segmenter": "cow_service.segmenters",
     "detector": "cow_service.detectors",
     "depth": "cow_service.depth_estimators",
@@ -35,6 +36,7 @@ SETS: dict[str, tuple[str, ...]] = {  # by the value of COW_PERCEPTION; all of t
 }
 ImageKey = tuple[str | None, str]
 """The owner of the image, so that timing does not reveal the images of others; and its SHA-256."""
+EYE = "eye"  # the finder of the default installation
 MOST_EMBEDDINGS = 8  # images whose embedding is kept: some 16 MB each of a large model
 
 
@@ -60,6 +62,25 @@ class Thing:
     def centre(self) -> tuple[float, float]:
         """Centre of the box, px."""
         return (self.bbox[0] + self.bbox[2]) / 2, (self.bbox[1] + self.bbox[3]) / 2
+
+
+class Finder(Protocol):
+    """Finds what stands in a picture. Safe to use from several threads, as all of these are."""
+
+    fingerprint: str
+    """Everything that determines what it finds: model, revision, options. The same holds for all protocols here."""
+
+    def find(self, image: Image, names: Sequence[str] = ()) -> tuple[Thing, ...]:
+        """Things in an image without drawings on it: those of some names, or whatever stands there if it knows none."""
+        ...
+
+
+class Find(Protocol):
+    """What `Finder.find` is."""
+
+    def __call__(self, image: Image, /, names: Sequence[str] = ()) -> tuple[Thing, ...]:
+        """See there."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -88,10 +109,9 @@ class Segment:
 
 
 class Segmenter(Protocol):
-    """Cuts things out. Safe to use from several threads, as all of these are."""
+    """Cuts things out."""
 
     fingerprint: str
-    """Everything that determines what it finds: model, revision, options. The same holds for all protocols here."""
 
     def embed(self, image: Image) -> Any:
         """What it knows of an image before it is asked for a thing: computed once, used for every prompt."""
@@ -181,10 +201,12 @@ class Perception:
         self._lock = RLock()  # `embed` asks for an image with it held, which may be one that is kept here
 
     def _chosen(self, wanted: str) -> dict[PerceptionKind, str]:
-        chosen: dict[PerceptionKind, str] = {}
         said = [each.strip().lower() for each in wanted.split(",") if each.strip()]
-        if said == ["none"]:
-            return {}  # without a look at what is installed, which takes 35 ms
+        if "none" in said and len(said) > 1:
+            raise SettingsError("Bad settings: COW_PERCEPTION: 'none' turns all models off: name it alone.")
+        if said in (["none"], [EYE]):  # without a look at what is installed, which takes 35 ms
+            return {} if said == ["none"] else {"finder": EYE}
+        chosen: dict[PerceptionKind, str] = {}
         kinds: dict[str, PerceptionKind] = {name: kind for kind, name in self.installed()}
         for name in (name for each in said for name in SETS.get(each, (each,))):
             kind = kinds.get(name)
@@ -193,7 +215,7 @@ class Perception:
                 fault = "is no such model" if kind is None else f"is a second {kind} beside {chosen[kind]!r}"
                 raise SettingsError(f"Bad settings: COW_PERCEPTION: {name!r} {fault}. It takes: {known}.")
             chosen[kind] = name
-        return chosen
+        return {"finder": EYE, **chosen}
 
     def installed(self) -> list[tuple[PerceptionKind, str]]:
         """All that may be chosen, by kind and name."""
@@ -205,6 +227,11 @@ class Perception:
             return None
         check_modules(self.names[kind], PerceptionMissing)
         return self._registries[kind].get(self.names[kind])
+
+    @property
+    def finder(self) -> Finder | None:
+        """See `segmenter`."""
+        return cast(Finder | None, self.load("finder"))
 
     @property
     def segmenter(self) -> Segmenter | None:

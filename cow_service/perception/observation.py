@@ -23,7 +23,7 @@ from cow_service.media.masks import (
     without_holes,
 )
 from cow_service.media.types import Floats, Image, Mask
-from cow_service.perception.base import ImageKey, Thing
+from cow_service.perception.base import Find, ImageKey, Perception, Thing
 from cow_service.perception.classical.arrows import Arrow, DrawnBox, find_arrows, find_boxes
 from cow_service.perception.classical.contrast import VIEW
 from cow_service.perception.classical.edges import find_segments
@@ -34,7 +34,7 @@ from cow_service.perception.classical.shadows import find_shadow
 from cow_service.perception.classical.side_view import SideView, find_side_view
 from cow_service.perception.classical.strokes import WorkingImage, find_strokes
 from cow_service.perception.classical.trails import Trail, find_trails, trail_ending_at, without_earlier_positions
-from cow_service.physics.seen import Shadow
+from cow_service.physics.bodies import Shadow
 from cow_service.records import BBox, Grounding, LocatedObject, Point
 
 SHARP_SIDE = 2 * VIEW.working_side  # px: in a larger image the outlines of things are coarse, and are cut again
@@ -47,6 +47,7 @@ PART_OF = 0.5  # of its area: what lies in a thing that was outlined is no thing
 MOST_NOTES = 256  # measurements by box that an observation keeps: each may hold a mask
 
 Found = TypeVar("Found")
+NOT_MEASURED: Any = object()
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class Observation:
     cues: Mask  # [H, W] of every arrow and box drawn over the image: cues for the reader, not part of the world
     undrawn: Image  # [H, W, 3] without arrows and boxes
     side_view: SideView | None  # the drawing seen from the side that it is; None for a picture that has depth
+    find: Find  # what things are found by
     clean: Image  # [H, W, 3] without its cues: neither drawings nor earlier positions of a trail
     things: tuple[Thing, ...]  # largest first; empty if the image is too cluttered to tell
     trails: tuple[Trail, ...] = ()  # positions of one ball each, the present one last
@@ -80,13 +82,13 @@ class Observation:
     _notes: dict[Hashable, Any] = field(default_factory=dict[Hashable, Any], repr=False)
 
     def _once(self, key: Hashable, measure: Callable[[], Found]) -> Found:
-        if key not in (notes := self._notes):
+        found = self._notes.get(key, NOT_MEASURED)
+        if found is NOT_MEASURED:
             found = measure()
-            if len(notes) >= MOST_NOTES:
-                notes.clear()
-            notes[key] = found
-            return found
-        return notes[key]
+            if len(self._notes) >= MOST_NOTES:
+                self._notes.clear()
+            self._notes[key] = found
+        return found
 
     @property
     def width(self) -> int:
@@ -208,11 +210,16 @@ class Observation:
         apart = [each for each in named if each.mask is not None or not is_same_object(each.bbox, mover)]
         obstacles = [self._obstacle_of(each) for each in apart]
         outlined = [self.mask_in(each.bbox) for each in named if each.mask is not None]
+        cut = [self.mask_in(each.bbox) for each in named]
         for thing in self.things:
             mask, area = thing.mask, thing.mask.area
             is_own = mask.shared_with(whole) > 0.5 * area or (area < least and mask.shared_with(near))
             is_known = is_among(thing.bbox, (mover, *(other.bbox for other in obstacles)))
-            if not is_own and not is_known and not _is_part(thing, outlined, obstacles):
+            if (
+                not is_own
+                and not is_known
+                and not _is_part(thing, outlined if thing.confidence >= CLEAR_CUT else cut, obstacles)
+            ):
                 obstacles.append(Obstacle(f"{thing.colour} object", thing.bbox, mask, thing.confidence))
         return tuple(obstacles)
 
@@ -264,26 +271,26 @@ class Observation:
         drawn = tuple(each for each in self.boxes if not is_thing(each))
         if len(arrows) + len(drawn) == len(self.arrows) + len(self.boxes):
             return self
-        found = _observed(self.image, arrows, drawn).with_masks(self.masks)
+        found = _observed(self.image, arrows, drawn, self.find).with_masks(self.masks)
         return found.with_trails() if self.is_searched_for_trails else found
 
 
-def look(image: Image, trails: bool = False) -> Observation:
+def look(image: Image, trails: bool = False, find: Find = find_regions) -> Observation:
     """What an upright RGB image [H, W, 3] shows; its trails where somebody speaks of one."""
     small = WorkingImage.of(image)
     strokes = tuple(find_strokes(small.pixels))
-    found = _observed(image, find_arrows(small, strokes), find_boxes(small, strokes))
+    found = _observed(image, find_arrows(small, strokes), find_boxes(small, strokes), find)
     return found.with_trails() if trails else found
 
 
-def _observed(image: Image, arrows: tuple[Arrow, ...], boxes: tuple[DrawnBox, ...]) -> Observation:
+def _observed(image: Image, arrows: tuple[Arrow, ...], boxes: tuple[DrawnBox, ...], find: Find) -> Observation:
     cues = np.zeros(image.shape[:2], bool)
     for drawing in (*arrows, *boxes):
         cues |= drawing.mask
     undrawn = erase_drawing(image, cues)
     side_view = find_side_view(undrawn)
-    things = _things_in(undrawn, side_view, ())
-    return Observation(image, arrows, boxes, cues, undrawn, side_view, undrawn, things)
+    things = _things_in(undrawn, find, side_view, ())
+    return Observation(image, arrows, boxes, cues, undrawn, side_view, find, undrawn, things)
 
 
 def _with_trails(seen: Observation, trails: tuple[Trail, ...]) -> Observation:
@@ -292,14 +299,14 @@ def _with_trails(seen: Observation, trails: tuple[Trail, ...]) -> Observation:
     for trail in trails:
         clean = without_earlier_positions(clean, trail)
     if trails:
-        things = _things_in(clean, seen.side_view, trails)
+        things = _things_in(clean, seen.find, seen.side_view, trails)
     return replace(seen, clean=clean, things=things, trails=trails, is_searched_for_trails=True, _notes={})
 
 
-def _things_in(clean: Image, side_view: SideView | None, trails: Sequence[Trail]) -> tuple[Thing, ...]:
+def _things_in(clean: Image, find: Find, side_view: SideView | None, trails: Sequence[Trail]) -> tuple[Thing, ...]:
     if side_view is not None:
         return _largest_first(thing_of(clean, shape) for shape in side_view.shapes)
-    found = find_regions(clean)
+    found = find(clean)
     for trail in trails:
         if best_in(found, trail.present.bbox) is None:
             ball = CroppedMask.of(trail.present.disc(clean.shape[:2]))
@@ -318,7 +325,10 @@ def _largest_first(things: Iterable[Thing]) -> tuple[Thing, ...]:
 
 
 def _is_part(thing: Thing, outlined: Sequence[CroppedMask], obstacles: Sequence[Obstacle]) -> bool:
-    """Whether a thing lies in one that was outlined, or is small, doubtful and touches another."""
+    """Whether a thing lies in one that was outlined, or is small, doubtful and touches another.
+
+    Something doubtful may also lie in what was cut out in the box of a named thing.
+    """
     area = thing.mask.area
     near = [mask.full() for mask in outlined if iou(mask.bbox, thing.bbox)]
     if any(thing.mask.shared_with(mask) > PART_OF * area for mask in near):
@@ -344,40 +354,53 @@ def arrow_fault(seen: Observation, grounding: Grounding) -> str:
 
 
 MOST_IMAGES = 8
-MOST_PIXELS = 13_000_000  # of all of them together: each holds some bytes per pixel
+MOST_PIXELS = 13_000_000  # of all but the latest together: each holds some bytes per pixel
 
 
 class SeenImages:
     """What images show, the latest used last. Safe to use from several threads."""
 
-    def __init__(self) -> None:
-        self._lock = Lock()
+    def __init__(self, perception: Perception | None = None) -> None:
+        """`perception`: the models of a server, of which its finder looks, too."""
+        self._perception, self._lock = perception, Lock()
         self._kept: OrderedDict[tuple[ImageKey, bool], Observation] = OrderedDict()
 
-    def look(self, key: ImageKey, image: Image, trails: bool = False) -> Observation:
-        """What an image shows, found before or now."""
+    def look(self, key: ImageKey, image: Callable[[], Image], trails: bool = False) -> Observation:
+        """What an image shows, found before or now; it is asked for only where it is new."""
         with self._lock:
             found = self._kept.get((key, trails))
         if found is None:  # its trails are looked for in what is known of it
-            found = self.look(key, image).with_trails() if trails else look(image)
+            finder = None if self._perception is None else self._perception.finder
+            find = find_regions if finder is None else finder.find
+            found = self.look(key, image).with_trails() if trails else look(image(), find=find)
         with self._lock:
             self._kept[key, trails] = found
             self._kept.move_to_end((key, trails))
-            while len(self._kept) > MOST_IMAGES or sum(each.cues.size for each in self._kept.values()) > MOST_PIXELS:
+            while len(self._kept) > MOST_IMAGES or (
+                len(self._kept) > 1 and sum(each.cues.size for each in self._kept.values()) > MOST_PIXELS
+            ):
                 self._kept.popitem(last=False)
         return found
 
 
 class Sight:
-    """One run's looks at its image, each made once. To be used with the CPU held."""
+    """One run's looks at its image, each made once. To be used with the CPU held.
 
-    def __init__(self, image: Image, key: ImageKey = (None, ""), shared: SeenImages | None = None) -> None:
+    What is measured in a box is remembered for the run alone: of a large picture each mask takes megabytes.
+    """
+
+    def __init__(self, image: Image, key: ImageKey, shared: SeenImages) -> None:
         self.key = key
-        self._image, self._shared, self._closer = image, shared or SeenImages(), dict[Hashable, Observation]()
+        self._image, self._shared, self._looks = image, shared, dict[Hashable, Observation]()
+
+    def _once(self, key: Hashable, see: Callable[[], Observation]) -> Observation:
+        if key not in self._looks:
+            self._looks[key] = see()
+        return self._looks[key]
 
     def look(self, trails: bool = False) -> Observation:
         """What the image shows before it is known what moves."""
-        return self._shared.look(self.key, self._image, trails)
+        return self._once(trails, lambda: replace(self._shared.look(self.key, lambda: self._image, trails), _notes={}))
 
     def look_closer(
         self,
@@ -389,8 +412,10 @@ class Sight:
     ) -> Observation:
         """What it shows once it is known what moves: neither that nor the other things are annotations, and where
         trails are spoken of, one ends at the mover. `masks` that were stored are read by their digests."""
-        key = mover, others, trails, masks
-        if key not in self._closer:
-            known = {bbox: CroppedMask.of(decode_own_mask(read(digest))) for bbox, digest in masks}
-            self._closer[key] = self.look(trails).with_masks(known).keeping((mover, *others)).with_mover(mover)
-        return self._closer[key]
+        key = mover, others, trails
+        closer = self._once(key, lambda: self.look(trails).keeping((mover, *others)).with_mover(mover))
+
+        def with_masks() -> Observation:
+            return closer.with_masks({box: CroppedMask.of(decode_own_mask(read(digest))) for box, digest in masks})
+
+        return self._once((key, masks), with_masks)

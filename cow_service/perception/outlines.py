@@ -91,15 +91,18 @@ def outlines_at(image: Embedded, point: Point) -> list[Outline]:
     return [each for each in outlines if each.mask.area]
 
 
-def find_named(detector: Detector, embedded: Embedded | None, image: Image, names: Sequence[str]) -> tuple[Thing, ...]:
+def find_named(
+    detector: Detector, embedded: Embedded | None, image: Image, clean: Image, names: Sequence[str]
+) -> tuple[Thing, ...]:
     """What a detector finds by some names in an image without drawings on it, outlined as well as can be.
 
-    One thing under two names is one thing. Without a segmenter outlines are cut by boxes.
+    One thing under two names is one thing. Without a segmenter outlines are cut by boxes, in the `clean` image, which
+    lacks earlier positions of a trail as well.
     """
     found = detector.detect(image, names)[:MOST_FOUND] if names else ()
     boxes = [each.bbox for each in found]
     if embedded is None:
-        masks = [CroppedMask.of(mask) if (mask := mask_from_bbox(image, box)).any() else None for box in boxes]
+        masks = [CroppedMask.of(mask) if (mask := mask_from_bbox(clean, box)).any() else None for box in boxes]
     else:
         masks = [each.mask if each and each.is_sure else None for each in outlines_in(embedded, boxes)]
     things = list[Thing]()
@@ -109,7 +112,7 @@ def find_named(detector: Detector, embedded: Embedded | None, image: Image, name
         full = mask.full()
         twin = next((at for at, one in enumerate(things) if mask_iou(one.mask.full(), full) > SAME_THING), None)
         if twin is None:
-            things.append(replace(thing_of(image, mask), is_disc=False, called=frozenset((each.phrase,))))
+            things.append(replace(thing_of(clean, mask), is_disc=False, called=frozenset((each.phrase,))))
         else:
             things[twin] = replace(things[twin], called=things[twin].called | {each.phrase})
     return tuple(things)

@@ -10,8 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from cow_service.media.types import Floats
-from cow_service.physics.bodies import SeenBody, no_edges
-from cow_service.physics.seen import Shadow
+from cow_service.physics.bodies import SeenBody, Shadow, no_edges
 from cow_service.physics.vanishing import Segments, Views
 from cow_service.records import BBox, CameraEstimate, CameraSource, Estimate, Shape, Vector
 from cow_service.requests import CameraRequest

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from cow_service.media.types import Floats, Mask
+from cow_service.physics.bodies import SeenOpening
 from cow_service.physics.draws import COLUMN
 from cow_service.physics.engine import BOX_SIDES, ROUND_SIDES, TIPPED, Hollow, RigidShape, WorldRun, run_worlds
-from cow_service.physics.seen import SeenOpening
 from cow_service.records import PlacementResult, PlaceRelation
 
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cow_service.media.types import Floats
+from cow_service.physics.bodies import Position
 from cow_service.physics.camera import CameraFit, axes_of, gauss_newton
-from cow_service.physics.seen import Position
 
 CENTRE_SIGMA = 0.35, 0.008  # px, and of the radius: of a position's centre; the larger counts
 RADIUS_SIGMA = 0.35, 0.01  # px, and of the radius

@@ -306,7 +306,7 @@ def _text(record: Record) -> str:
     return record.model_dump_json(indent=2) + "\n"
 
 
-BackendKind = Literal["reader", "generator", "segmenter", "detector", "depth", "inpainter"]
+BackendKind = Literal["reader", "generator", "finder", "segmenter", "detector", "depth", "inpainter"]
 
 
 class BackendInfo(Record):
@@ -417,7 +417,8 @@ class Look(Record):
     width: int
     height: int
     things: tuple[SeenObject, ...] = Field(
-        description="Best first. At a point there may be several objects within each other, or none that is certain."
+        description="Best first; without a segmenter smallest first. "
+        "At a point there may be several objects within each other, or none that is certain."
     )
 
 

@@ -166,7 +166,9 @@ def _inputs(
 
 def scene_of(observation: Observation, grounding: Grounding, trajectory: Trajectory) -> Scene:
     """The picture that a clip begins with."""
-    side_view, is_in_air = observation.side_view, bool(trajectory.bodies) and trajectory.bodies[0].support == "air"
+    # Something that is put elsewhere may leave the air by that.
+    begins = [each.bodies[0] for each in (trajectory, trajectory.factual) if each is not None and each.bodies]
+    side_view, is_in_air = observation.side_view, any(body.support == "air" for body in begins)
     return Scene(
         image=observation.image,
         clean=observation.clean,

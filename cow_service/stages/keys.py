@@ -102,7 +102,7 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
         "reader",
         set_by_request=("place",),
         always=("question", "question_is_doubtful", "asked", "objects", "objects_complete", "interventions"),
-        perception=("detector", "segmenter"),
+        perception=("finder", "detector", "segmenter"),
         # The reader is asked the same of the place; hints for the motion are not used where the request gives it.
         read_with="motion",
     ),
@@ -112,10 +112,11 @@ KEY_FIELDS: dict[Stage, KeyFields] = {
         set_by_request=("whole_motion", "trajectory"),
         always=("question", "law", "motion", "camera", "depth"),
         prompt="motion-sentence",
+        perception=("finder",),
     ),
     "depth": KeyFields((), perception=("depth",)),
-    "trajectory": KeyFields(TRAJECTORY_FIELDS),
-    "generation": KeyFields(("clip_seed", "frames", "video"), "generator", perception=("inpainter",)),
+    "trajectory": KeyFields(TRAJECTORY_FIELDS, perception=("finder",)),
+    "generation": KeyFields(("clip_seed", "frames", "video"), "generator", perception=("finder", "inpainter")),
     "answering": KeyFields(("question", "language", "seed", "options", "votes"), "reader", votes="votes"),
 }
 # Of a simulation its id and times do not decide an answer.

@@ -190,7 +190,7 @@ def find_things(run: Run[SimulateRequest], observation: Observation, names: Sequ
     """What the models of the server find by some names. To be called with `cpu` held."""
     detector, embedded = run.backends.perception.detector, _embedded(run, observation) if run.can_segment else None
     assert detector is not None, "asked for only where there is a detector"
-    return find_named(detector, embedded, observation.undrawn, names)
+    return find_named(detector, embedded, observation.undrawn, observation.clean, names)
 
 
 def bare(

@@ -12,12 +12,11 @@ from cow_service.media.masks import iou, is_same_object
 from cow_service.narration.story import OF_ITSELF, OF_TARGET
 from cow_service.narration.words import place_words
 from cow_service.physics.ballistic import Camera, FreePath, ballistic_path, given_path
-from cow_service.physics.bodies import SeenBody, supports_of
+from cow_service.physics.bodies import SeenBody, SeenOpening, supports_of
 from cow_service.physics.camera import SIDE_VIEW, CameraFit, Standing, camera_of, given_camera
 from cow_service.physics.ensemble import BY_EVENTS, OF_EACH, SURE, SURE_OF_FIT, SURE_OF_MISS, Query
 from cow_service.physics.geometry import Measurement, measure_scene, rise_above
 from cow_service.physics.placement import PlacementGoal
-from cow_service.physics.seen import SeenOpening
 from cow_service.physics.world import PrescribedMotion, WorldInput
 from cow_service.records import Asked, BBox, Intervention, LocatedObject, Motion
 from cow_service.stages.seeing import Situation

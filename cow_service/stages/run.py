@@ -152,7 +152,8 @@ class Run(Generic[Request_co]):
 
     def share(self, seen: SeenImages | None, owner: str | None = None) -> None:
         """Finds what other runs of its owner have seen in its image, and has them find what it sees. None: nothing."""
-        self.sight = Sight(self.image.pixels, (owner, self.image.info.sha256), seen)
+        shared = seen or SeenImages(self.backends.perception)
+        self.sight = Sight(self.image.pixels, (owner, self.image.info.sha256), shared)
 
     def observe(self, mover: LocatedObject | Grounding, others: Sequence[LocatedObject], trails: bool) -> Observation:
         """What the image shows once it is known what moves and what else matters. To be called with `cpu` held.

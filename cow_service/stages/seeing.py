@@ -14,9 +14,8 @@ from cow_service.perception.classical.edges import divide
 from cow_service.perception.classical.forms import shape_seen
 from cow_service.perception.classical.openings import measure_opening
 from cow_service.perception.observation import CLEAR_CUT, Observation, Obstacle
-from cow_service.physics.bodies import SeenBody, no_edges
+from cow_service.physics.bodies import SeenBody, SeenOpening, Shadow, no_edges
 from cow_service.physics.geometry import DepthMap
-from cow_service.physics.seen import SeenOpening, Shadow
 from cow_service.records import Asked, BBox, Estimate, Grounding, Intervention, LocatedObject, Motion, ObjectPrior
 from cow_service.requests import SimulateRequest
 from cow_service.stages.depth import depth_map, focal_of

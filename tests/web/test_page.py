@@ -345,7 +345,7 @@ def test_names_of_files_and_names_that_are_typed_are_text(server: Server, window
     no_markup(page, title)
     drop(page, png_bytes(clutter(200, 150)))
     ask(page, f"If the {MARKUP} moves to the right, will it hit the cube?")
-    expect(page.locator(".notice.problem")).to_contain_text("Looked for")
+    expect(page.locator(".notice.problem")).to_contain_text("What moves is not clear")
     no_markup(page, title)
     page.get_by_role("button", name="Another object", exact=True).click()
     drag_in_picture(page, (120, 40), (160, 90))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -103,16 +104,28 @@ def test_the_pointer_lights_what_is_under_it(seen: Seen) -> None:
     for step in range(40):  # on the bare floor nothing is lit, so all points are new
         seen.page.mouse.move(*seen.at((BARE[0] + step, BARE[1])))
     expect(lit).to_have_count(0)
-    expect(seen.page.get_by_text("No clear outline here: draw a box.")).to_be_visible()
+    expect(seen.page.get_by_text("Nothing was found here: draw a box.")).to_be_visible()
     assert looks() > count + 1
     assert seen.most_in_flight == 1  # where the pointer was while another point was asked about is left out
+
+
+def test_without_a_segmenter_the_small_network_sees(server: Server, windows: Windows) -> None:
+    seen = Seen(server.address, windows)
+    seen.page.mouse.move(*seen.at(BALL))
+    expect(seen.page.locator("image.lit")).to_have_count(1)
+    seen.page.mouse.move(*seen.at(BARE))
+    expect(seen.page.get_by_text("Nothing was found here: draw a box.")).to_be_visible()
+    seen.page.mouse.click(*seen.at(BALL))
+    expect(seen.page.locator("rect.mover")).to_have_count(1)
+    seen.page.locator("#question").fill(QUESTION)
+    assert seen.request["grounding"]["mask"].startswith("data:image")
 
 
 def test_clicks_take_what_is_there_or_a_box_is_drawn(seen: Seen) -> None:
     page = seen.page
     page.mouse.click(*seen.at(BARE))
     expect(page.get_by_role("button", name="What moves", exact=True)).to_have_attribute("aria-pressed", "true")
-    expect(page.get_by_text("No clear outline here: draw a box.")).to_be_visible()
+    expect(page.get_by_text("Nothing was found here: draw a box.")).to_be_visible()
     drag_in_picture(page, (10, 10), (40, 40))
     expect(page.locator("rect.mover")).to_have_attribute("width", "30")
     page.locator("#question").fill(QUESTION)
@@ -164,7 +177,7 @@ def test_a_server_that_forgets_the_picture_is_sent_it_again(served: Served, wind
     seen = Seen(str(served.http.base_url), windows, requests_fail=True)
     page, forgets = seen.page, {"type": "urn:cow:problem:artifact-not-found", "title": "Gone.", "detail": "Gone."}
     page.mouse.move(*seen.at(BARE))
-    expect(page.get_by_text("No clear outline here: draw a box.")).to_be_visible()  # the picture is there
+    expect(page.get_by_text("Nothing was found here: draw a box.")).to_be_visible()  # the picture is there
     uploads = len([body for path, body in seen.requests if path == "look" and not body])
     replies = iter([json.dumps(forgets)])
 
@@ -185,8 +198,14 @@ def floor_of(page: Page) -> tuple[float, str]:
     )
 
 
-def test_without_a_segmenter_boxes_are_drawn_and_the_floor_is_dragged(server: Server, windows: Windows) -> None:
-    seen = Seen(server.address, windows, bypass_csp=True)
+@pytest.fixture
+def blind(tmp_path: Path) -> Iterator[Served]:
+    with Served(tmp_path, COW_PERCEPTION="none") as one:
+        yield one
+
+
+def test_without_models_boxes_are_drawn_and_the_floor_is_dragged(blind: Served, windows: Windows) -> None:
+    seen = Seen(str(blind.http.base_url), windows, bypass_csp=True)
     page = seen.page
     page.mouse.move(*seen.at(BALL))
     page.mouse.click(*seen.at(BALL))
@@ -196,7 +215,7 @@ def test_without_a_segmenter_boxes_are_drawn_and_the_floor_is_dragged(server: Se
     expect(page.locator("rect.mover")).to_have_attribute("width", "36")
     page.get_by_role("button", name="Ask", exact=True).click()
     first = result(page)  # by then the page has long seen that the typing is over
-    assert [path for path, _ in seen.requests if path == "look"] == [], "no segmenter: nobody looks"
+    assert [path for path, _ in seen.requests if path == "look"] == [], "no model: nobody looks"
     page.get_by_label("Floor", exact=True).check()
     pitch, lines = floor_of(page)
     drag_in_picture(page, (120, 140), (150, 120))

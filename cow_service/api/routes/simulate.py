@@ -103,6 +103,7 @@ async def answer(request: Request, submitter: JobSubmitter) -> Response:
 async def look(request: Request, submitter: JobSubmitter) -> Look:
     """Outlines what the models of the server see at a point, in a box, or of what a question names. Makes no job.
 
-    A server without such models answers `perception-missing`.
+    A point or a box needs a segmenter, or the small network that comes with COW; a question also needs a detector. A
+    server without them answers `perception-missing`.
     """
     return await submitter.look(request)

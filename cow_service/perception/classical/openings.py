@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cow_service.media.masks import CroppedMask
-from cow_service.physics.seen import Rim, SeenOpening
+from cow_service.physics.bodies import Rim, SeenOpening
 
 
 class RimRules(NamedTuple):

@@ -6,7 +6,7 @@ hue, are left out. Where the surroundings vary too much (most photographs), no r
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
@@ -48,8 +48,6 @@ class RegionRules(NamedTuple):
     most: int = 40  # the largest are kept: the work that follows grows with their number
     clutter: float = 0.30  # share of the image that may differ from its surroundings before it counts as cluttered
     split_hue: float = 36.0  # degrees: another colour, hence another object
-    filled: float = 0.9  # of its hull: what a part fills
-    ellipse: float = 0.95  # of a hull and the ellipse of its outline: what both share
     own_area: int = 250  # px at the working size: a patch of another colour this large is no part of a thing
     edge_band: float = 4.0  # px: half the width of an edge as it is measured
     min_rest: float = 0.05  # of a component: less is no part of its own
@@ -57,6 +55,7 @@ class RegionRules(NamedTuple):
     own_width: float = 0.55  # of the narrowest colour: black narrower than this is a neck or a wheel
     mask_sigma: float = 0.8  # px at the working size, smooths the stairs of an enlarged mask
     disc: float = 0.93  # roundness from which a drawn shape is a disc
+    dark: float = 28.0  # lightness below which a part may be the underside of another
     sure_contrast: float = 20.0  # Lab units: from here on contrast takes nothing from the confidence
     sure_area: float = 300.0  # px at the working size, from which the size takes nothing
 
@@ -111,6 +110,7 @@ def find_regions(image: Image, names: Sequence[str] = ()) -> tuple[Thing, ...]:
             whole[window] = shape
             confidence = _confidence(near, shape, border[window], disc is not None)
             found.append(_Found(whole, near.lab[part], confidence, disc is not None))
+    found = _with_undersides(found)
     pairs = zip(found, _hidden(found), strict=True)
     regions = [one.region((height, width), is_hidden) for one, is_hidden in pairs]
     return tuple(sorted(regions, key=lambda region: -region.mask.area)[: REGION.most])
@@ -223,20 +223,7 @@ def _parts(view: View, component: Mask) -> list[Mask]:
     rest = _blobs(component & ~taken, REGION.min_rest * component.sum())
     if balls:  # what is left along the edge of a ball is blur
         rest = [blob for blob in rest if masks.half_width(blob) > REGION.edge_band]
-    parts = balls + [part for blob in rest for part in _coloured_parts(view, blob)]
-    if len(parts) > 1:
-        whole = masks.hull(component)
-        if np.count_nonzero(component) > REGION.filled * np.count_nonzero(whole) and _is_ellipse(whole):
-            return [whole]  # a ball or an egg, and a shadow across it
-    return parts
-
-
-def _is_ellipse(mask: Mask) -> bool:
-    """Whether a mask [h, w] without holes is an ellipse, as a ball at the side of a wide view is."""
-    outline = np.argwhere(masks.outline_of(mask))[:, ::-1].astype(np.int32)
-    ellipse = np.zeros(mask.shape, np.uint8)
-    cv2.ellipse(ellipse, cv2.fitEllipse(outline), (1,), -1)
-    return masks.mask_iou(mask, ellipse > 0) > REGION.ellipse
+    return balls + [part for blob in rest for part in _coloured_parts(view, blob)]
 
 
 def _coloured_parts(view: View, component: Mask) -> list[Mask]:
@@ -316,6 +303,24 @@ def _confidence(view: View, part: Mask, border: Mask, is_disc: bool) -> float:
     if is_disc:
         sharp, contrast, size = max(sharp, 0.9), 1.0, 2 * size
     return sharp * min(1.0, contrast**0.5) * min(1.0, size**0.5) * (1 - cut_off / 2)
+
+
+def _with_undersides(found: Sequence[_Found]) -> list[_Found]:
+    """Joins dark lower ends, such as a car's wheels with the shade between them, with what they carry."""
+    dark, whole = list[_Found](), list[_Found]()
+    for one in found:
+        lightness, a, b = np.median(one.lab, axis=0).tolist()
+        is_dark = lightness < REGION.dark and colour_name(lightness, a, b) in {"black", "brown"}
+        (dark if is_dark and not one.is_disc else whole).append(one)
+    for part in dark:
+        box, near = masks.bbox_of(part.mask), masks.dilated(part.mask)
+        touched = [i for i, one in enumerate(whole) if (one.mask & near).any()]
+        match [i for i in touched if is_underside(box, masks.bbox_of(whole[i].mask))]:
+            case [i]:
+                whole[i] = replace(whole[i], mask=whole[i].mask | part.mask)
+            case _:
+                whole.append(part)
+    return whole
 
 
 def _names(lab: Floats32) -> tuple[str, frozenset[str]]:

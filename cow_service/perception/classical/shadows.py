@@ -16,7 +16,7 @@ import numpy as np
 from cow_service.media.masks import CroppedMask, lab_of, resized_mask, scaled
 from cow_service.media.types import Floats, Floats32, Image, Mask
 from cow_service.perception.classical.inpainting import quadratic_terms
-from cow_service.physics.seen import Shadow
+from cow_service.physics.bodies import Shadow
 from cow_service.records import BBox
 
 

@@ -20,7 +20,7 @@ from cow_service.media.masks import iou, window_of
 from cow_service.media.types import Floats, Floats32, Image, Mask
 from cow_service.perception.classical.circles import BINS, Circle, Edges
 from cow_service.perception.classical.inpainting import fill_hole
-from cow_service.physics.seen import Position
+from cow_service.physics.bodies import Position
 from cow_service.records import BBox, Point, Vector
 
 

@@ -13,9 +13,11 @@ const PAUSE = 0.1; // s between two looks: moving over a bare floor must not kee
 const ARTICLES = ["the", "a", "an"];
 const MOST_WORDS = 4; // of a name in a question
 
-/** Whether the server has a model of a kind. Where a look at this picture failed, boxes are drawn as without one. */
-export const canSee = ({ models, blind }, kind = "segmenter") =>
-  !blind && Boolean(models?.perception?.some((each) => each.kind === kind && each.default && each.ready !== false));
+const OUTLINING = ["finder", "segmenter"];
+
+/** Whether the server has a model of one of some kinds. Where a look at this picture failed, boxes are drawn as without one. */
+export const canSee = ({ models, blind }, kinds = OUTLINING) =>
+  !blind && Boolean(models?.perception?.some((each) => kinds.includes(each.kind) && each.default && each.ready !== false));
 
 let sent = { url: null, sha256: null }; // the picture, and a promise of the digest by which the server knows it
 

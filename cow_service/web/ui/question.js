@@ -58,7 +58,7 @@ export function Question({ state }) {
 function Chips({ state }) {
   const { question, picture, named, corrections } = state;
   const asked = question.trim();
-  const canFind = canSee(state) && canSee(state, "detector") && picture.blob !== null; // of an opened job all is known
+  const canFind = canSee(state, ["segmenter"]) && canSee(state, ["detector"]) && picture.blob !== null; // of an opened job all is known
   useEffect(() => {
     if (!canFind || !asked) return undefined;
     const timer = setTimeout(() => void lookFor(asked), TYPING_ENDS);

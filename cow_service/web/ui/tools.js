@@ -30,7 +30,7 @@ function hintOf({ tool, lit, result }, isSeeing) {
   if (!isSeeing && tool === "select") return result.simulation.trajectory.live ? "Drag the tip of the arrow: the outcome changes at once." : "Drag boxes, or points of the path, where something was misread.";
   if (!isSeeing) return TOOLS.find(([name]) => name === tool)[2];
   if (lit?.others) return `Click again for another of the ${lit.others + 1} objects that overlap here.`;
-  return lit && !lit.things.length ? "No clear outline here: draw a box." : CLICKS[tool];
+  return lit && !lit.things.length ? "Nothing was found here: draw a box." : CLICKS[tool];
 }
 
 export function Tools({ state, layers, setLayers, hasFutures, hasFloor, isSeeing }) {

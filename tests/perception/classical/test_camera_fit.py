@@ -13,11 +13,10 @@ from floors import TrueCamera, outline
 
 from cow_service.media.masks import CroppedMask
 from cow_service.perception.classical.edges import divide, find_segments
-from cow_service.physics.bodies import SeenBody
+from cow_service.physics.bodies import SeenBody, Shadow
 from cow_service.physics.camera import MEASUREMENT_SIGMA, CameraFit, Standing, fit_shadow, narrowed, prior
 from cow_service.physics.draws import ensemble
 from cow_service.physics.lift import Cameras
-from cow_service.physics.seen import Shadow
 from cow_service.records import BBox
 
 SIZE = (640, 400)

@@ -30,12 +30,6 @@ def with_top(foot: int, end: int, rgb: tuple[int, int, int], middle: int = 300) 
     return block(cv2.fillPoly(floor(), [corners], rgb, cv2.LINE_AA), BLOCK, BLUE)
 
 
-def half_lit() -> Image:
-    image = np.ascontiguousarray(floor(grey=150) * np.array([0.9, 1.0, 1.15])).astype(np.uint8)
-    cv2.ellipse(image, (320, 180), (80, 70), 30, 0, 360, WHITE, -1, cv2.LINE_AA)
-    return cv2.ellipse(image, (320, 180), (80, 70), 30, 0, 180, (60, 60, 60), -1, cv2.LINE_AA)
-
-
 def dark_below() -> Image:
     """A white ball whose lower part is as dark as the floor, which has another hue."""
     image = np.clip(floor(grey=128) * np.array([1.08, 1.0, 0.88]), 0, 255)
@@ -108,7 +102,6 @@ PICTURES: dict[str, tuple[Callable[[], Image], dict[str, Box]]] = {
         ),
         {"green ?": (250, 110, 320, 180), "black ?": (260, 180, 330, 240), "orange": (220, 238, 390, 370)},
     ),
-    "a ball with a hard shadow across": (half_lit, {"white": (243, 106, 397, 254)}),
     "a white ball on a white table": (
         lambda: ball(block(floor(grey=120), (200, 160, 380, 300), (205, 205, 205)), (290, 135), 36, (235, 235, 235)),
         {"white o": (254, 99, 326, 171), "white": (200, 160, 380, 300)},

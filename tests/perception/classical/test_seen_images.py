@@ -49,22 +49,22 @@ def test_trails_are_seen_apart_where_somebody_speaks_of_them() -> None:
     places = [(120.0, 250.0), (190.0, 250.0), (260.0, 250.0), (330.0, 250.0)]
     image = trail(floor(), places, [26.0] * 4, (200, 40, 40), [0.3, 0.5, 0.75, 1.0])
     seen = SeenImages()
-    plain, with_trails = (seen.look(("mine", "a"), image, trails) for trails in (False, True))
+    plain, with_trails = (seen.look(("mine", "a"), lambda: image, trails) for trails in (False, True))
     assert plain.trails == ()
     assert len(with_trails.trails) == 1
     assert len(plain.things) > len(with_trails.things)
     assert plain.clean is plain.undrawn is with_trails.undrawn is not with_trails.clean
-    assert [seen.look(("mine", "a"), image, trails) for trails in (False, True)] == [plain, with_trails]
+    assert [seen.look(("mine", "a"), lambda: image, trails) for trails in (False, True)] == [plain, with_trails]
 
 
 def test_only_the_latest_images_are_kept_each_for_its_owner_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     looked = list[tuple[int, ...]]()
-    monkeypatch.setattr(observation, "look", lambda image: looked.append(image.shape) or look(image))
+    monkeypatch.setattr(observation, "look", lambda image, **_: looked.append(image.shape) or look(image))
     seen, tiny = SeenImages(), np.zeros((40, 60, 3), np.uint8)
 
     def is_kept(owner: str | None, digest: str) -> bool:
         looked.clear()
-        seen.look((owner, digest), tiny)
+        seen.look((owner, digest), lambda: tiny)
         return not looked
 
     for number in range(MOST_IMAGES):
@@ -73,7 +73,8 @@ def test_only_the_latest_images_are_kept_each_for_its_owner_alone(monkeypatch: p
     assert not is_kept("mine", "one more")
     assert [is_kept("mine", each) for each in ("0", "2", "one more", "1")] == [True, True, True, False]
     assert not is_kept(None, "0")
-    seen.look(("mine", "large"), np.broadcast_to(np.uint8(0), (1, MOST_PIXELS - 2400, 3)))
+    large = np.broadcast_to(np.uint8(0), (1, MOST_PIXELS - 2400, 3))
+    seen.look(("mine", "large"), lambda: large)
     assert [is_kept("mine", each) for each in ("0", "1")] == [False, False]
 
 
@@ -97,7 +98,7 @@ def test_no_run_changes_what_others_see(request_: dict) -> None:
     run.share(seen)
     with suppress(CowError):
         simulate(run)
-    found, fresh = seen.look((None, run.image.info.sha256), run.image.pixels), look(PICTURE)
+    found, fresh = seen.look((None, run.image.info.sha256), lambda: run.image.pixels), look(PICTURE)
     for name in ("image", "cues", "undrawn", "clean"):
         assert np.array_equal(getattr(found, name), getattr(fresh, name)), name
     assert [(each.bbox, each.colour, each.mask.area) for each in found.things] == [

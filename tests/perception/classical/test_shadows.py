@@ -14,7 +14,7 @@ from drawn import floor as drawn_floor
 from floors import TrueCamera, outline
 
 from cow_service.perception.observation import look
-from cow_service.physics.seen import Shadow
+from cow_service.physics.bodies import Shadow
 from cow_service.records import BBox
 
 WIDTH, HEIGHT = 512, 320

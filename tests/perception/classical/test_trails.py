@@ -17,8 +17,8 @@ from runs import run_of
 from cow_service.perception.classical.circles import Edges
 from cow_service.perception.classical.trails import find_trails
 from cow_service.perception.observation import look
+from cow_service.physics.bodies import Position
 from cow_service.physics.camera import FloorCamera, prior
-from cow_service.physics.seen import Position
 from cow_service.physics.trail_fit import fit_throw, is_thrown, straight_direction
 from cow_service.readers.embedded.reader import EmbeddedReader
 from cow_service.records import Grounding
