@@ -75,12 +75,8 @@ class Finder(Protocol):
         ...
 
 
-class Find(Protocol):
-    """What `Finder.find` is."""
-
-    def __call__(self, image: Image, /, names: Sequence[str] = ()) -> tuple[Thing, ...]:
-        """See there."""
-        ...
+Find = Callable[[Image], tuple[Thing, ...]]
+"""Finds whatever stands in an image without drawings on it."""
 
 
 @dataclass(frozen=True)

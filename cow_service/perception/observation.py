@@ -210,16 +210,13 @@ class Observation:
         apart = [each for each in named if each.mask is not None or not is_same_object(each.bbox, mover)]
         obstacles = [self._obstacle_of(each) for each in apart]
         outlined = [self.mask_in(each.bbox) for each in named if each.mask is not None]
-        cut = [self.mask_in(each.bbox) for each in named]
+        of_named = [each.mask for each in obstacles]
         for thing in self.things:
             mask, area = thing.mask, thing.mask.area
             is_own = mask.shared_with(whole) > 0.5 * area or (area < least and mask.shared_with(near))
             is_known = is_among(thing.bbox, (mover, *(other.bbox for other in obstacles)))
-            if (
-                not is_own
-                and not is_known
-                and not _is_part(thing, outlined if thing.confidence >= CLEAR_CUT else cut, obstacles)
-            ):
+            wholes = outlined if thing.confidence >= CLEAR_CUT else of_named
+            if not (is_own or is_known or _is_part(thing, wholes, obstacles)):
                 obstacles.append(Obstacle(f"{thing.colour} object", thing.bbox, mask, thing.confidence))
         return tuple(obstacles)
 
@@ -238,11 +235,10 @@ class Observation:
 
     def with_found(self, found: Sequence[Thing]) -> Observation:
         """The same with things that models found. What lies in one of them for the most part is no thing of its own."""
-        masks = [each.mask.full() for each in found]
         own = [
             thing
             for thing in self.things
-            if all(thing.mask.shared_with(mask) <= PART_OF * thing.mask.area for mask in masks)
+            if all(thing.mask.overlap(each.mask) <= PART_OF * thing.mask.area for each in found)
         ]
         return replace(self, things=_largest_first((*found, *own)), _notes={})
 
@@ -327,11 +323,10 @@ def _largest_first(things: Iterable[Thing]) -> tuple[Thing, ...]:
 def _is_part(thing: Thing, outlined: Sequence[CroppedMask], obstacles: Sequence[Obstacle]) -> bool:
     """Whether a thing lies in one that was outlined, or is small, doubtful and touches another.
 
-    Something doubtful may also lie in what was cut out in the box of a named thing.
+    Something doubtful is also a part of a named thing in whose mask it lies.
     """
     area = thing.mask.area
-    near = [mask.full() for mask in outlined if iou(mask.bbox, thing.bbox)]
-    if any(thing.mask.shared_with(mask) > PART_OF * area for mask in near):
+    if any(thing.mask.overlap(mask) > PART_OF * area for mask in outlined):
         return True
     larger = [other.mask for other in obstacles if area < OWN_SHARE * other.mask.area]
     is_doubtful = thing.confidence < DOUBTFUL

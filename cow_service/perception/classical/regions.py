@@ -86,8 +86,8 @@ class _Found:
         return Thing(mask, *_names(self.lab), roundness, self.confidence, self.is_disc, is_hidden and not self.is_disc)
 
 
-def find_regions(image: Image, names: Sequence[str] = ()) -> tuple[Thing, ...]:
-    """Things of an RGB image [H, W, 3] without drawings on it, whatever their names; none in a cluttered image."""
+def find_regions(image: Image) -> tuple[Thing, ...]:
+    """Things of an RGB image [H, W, 3] without drawings on it, largest first; none in a cluttered image."""
     height, width = image.shape[:2]
     view = view_of(masks.scaled(image, min(1.0, VIEW.working_side / max(height, width))))
     solid = _solid(view)
