@@ -231,7 +231,7 @@ class PerceptionUnavailable(CowError, code="perception-unavailable", status=503)
 
 
 class PerceptionMissing(PerceptionUnavailable, code="perception-missing", status=501):
-    """The server has no vision models: none is chosen, or their packages are not installed."""
+    """The server lacks a vision model for this: none is chosen, or its packages are not installed."""
 
 
 class MllmBadReply(CowError, code="mllm-bad-reply", status=502):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from cow_service.errors import PerceptionUnavailable
-from cow_service.media.masks import CroppedMask
+from cow_service.media.masks import CroppedMask, dilated
 from cow_service.media.types import Floats, Floats32, Image, Mask
 from cow_service.perception.base import Thing
 from cow_service.perception.classical.regions import find_regions, thing_of
@@ -149,7 +149,9 @@ class Eye:
             for each in likely
             if all(each.mask.overlap(one.mask) < MATCH.shared * min(each.mask.area, one.mask.area) for one in kept)
         ]
-        return tuple(sorted((*kept, *new), key=lambda thing: -thing.mask.area))
+        found = [*kept, *new]  # what does not exist hides nothing
+        found = [replace(each, is_hidden=each.is_hidden and is_behind_any(each, found)) for each in found]
+        return tuple(sorted(found, key=lambda thing: -thing.mask.area))
 
     def look(self, image: Image) -> Seen:
         """What the network sees in an RGB image [H, W, 3]."""
@@ -248,6 +250,12 @@ class Eye:
 def create(settings: Settings) -> Eye:
     """Factory for the registry."""
     return Eye()
+
+
+def is_behind_any(thing: Thing, others: Sequence[Thing]) -> bool:
+    """Whether another thing that ends lower in the image touches it."""
+    grown = dilated(thing.mask.full(), 5)
+    return any(each.bbox[3] > thing.bbox[3] and each.mask.shared_with(grown) for each in others)
 
 
 def _sigmoid(logits: Floats32 | np.float64) -> Floats32:

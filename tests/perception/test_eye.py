@@ -98,6 +98,18 @@ def test_regions_and_what_is_seen_go_together(
     assert found == [pytest.approx(box, abs=3) for box in sorted(boxes)]
 
 
+def test_what_does_not_exist_hides_nothing(eye: Eye, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is hidden in part may have any outline: a bucket behind a patch of texture would pass for a ball."""
+    image = block(block(floor(), (200, 150, 300, 250), (30, 160, 60)), (230, 200, 330, 300), (40, 60, 200))
+    assert [each.is_hidden for each in find_regions(image) if each.colour == "green"] == [True]
+    standing = np.ones((400, 640), np.float32)
+    monkeypatch.setattr(Eye, "look", lambda *_: Seen((), standing))
+    assert [each.is_hidden for each in eye.find(image) if each.colour == "green"] == [True]
+    (blue,) = (each for each in find_regions(image) if each.colour == "blue")
+    standing[blue.mask.full()] = 0.0
+    assert [(each.colour, each.is_hidden) for each in eye.find(image)] == [("green", False)]
+
+
 def test_what_does_not_stand_is_no_thing(eye: Eye, monkeypatch: pytest.MonkeyPatch) -> None:
     standing = np.ones((400, 640), np.float32)
     standing[:, 160:] = MATCH.seen / 2
