@@ -205,7 +205,8 @@ def noun_doubts(
         odd = [each for each in phrase.text.lower().split()[:-1] if each not in SETS["adjectives"] | PLACES]
         colours = [each for each in odd if phrase.colour is None and get_close_matches(each, COLOURS, 1, NEARLY)]
         if colours:
-            reason = f": '{colours[0]}' is no colour that is known."
+            told = "may be the colour of a part of it" if colours[0] in COLOURS else "is no colour that is known"
+            reason = f": '{colours[0]}' {told}."
         elif any(phrase.noun in each.called for each in observation.things) and _shape_ratio(thing, phrase) <= CLEAR:
             reason = ": the detector calls another thing so."  # a detector misses some
         elif is_odd or (looks is not None and is_other and phrase.noun is not None and head not in GENERIC):
