@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from threading import Lock
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from cow_service.media.masks import CroppedMask, dilated
 from cow_service.media.types import Floats, Floats32, Image, Mask
 from cow_service.perception.base import Thing
 from cow_service.perception.classical.regions import find_regions, thing_of
+from cow_service.records import Record
 from cow_service.settings import Settings
 from cow_service.weights.manifests import CARDS, NETWORKS
 
@@ -52,10 +54,8 @@ class MatchRules(NamedTuple):
 MATCH = MatchRules()
 
 
-class Limits(BaseModel):
+class Limits(Record):
     """What counts as found, in the network's own units; part of its card."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     centre: float  # the least height of a centre
     member: float  # the least probability of a thing's pixel
@@ -65,10 +65,8 @@ class Limits(BaseModel):
     probability: float  # with which a thing is reported, at least
 
 
-class Calibration(BaseModel):
+class Calibration(Record):
     """A logistic regression from what the maps say of a thing to the probability that it is there; part of the card."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     constant: float
     member: float  # weight of the logit of the mean probability of its pixels
@@ -116,17 +114,24 @@ class Eye:
     def __init__(self) -> None:
         """Raises `PerceptionUnavailable` where the network is missing, or not the one that its card tells of."""
         try:
-            data, told = NETWORKS.file(NAME).read_bytes(), CARDS.read(NAME)
-            card, network = Card.model_validate_json(told), cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
-        except (LookupError, ValueError, OSError, cv2.error) as error:
+            self._data, card = NETWORKS.file(NAME).read_bytes(), Card.model_validate_json(CARDS.read(NAME))
+        except (LookupError, ValueError, OSError) as error:
             raise PerceptionUnavailable(DAMAGED) from error
-        digest = hashlib.sha256(data).hexdigest()
+        digest = hashlib.sha256(self._data).hexdigest()
         if digest != card.sha256:
             raise PerceptionUnavailable(DAMAGED)
         decided = json.dumps([digest, card.model_dump(mode="json"), MATCH, cv2.__version__])
         self.fingerprint = f"eye {hashlib.sha256(decided.encode()).hexdigest()[:16]}"
         self.limits, self.calibration = card.limits, card.calibration["standing"]
-        self._network, self._lock = network, Lock()
+        self._lock = Lock()
+
+    @cached_property
+    def _network(self) -> cv2.dnn.Net:
+        """Read when it first looks: a process that ends while OpenCV works in another thread crashes."""
+        try:
+            return cv2.dnn.readNetFromONNX(np.frombuffer(self._data, np.uint8))
+        except cv2.error as error:
+            raise PerceptionUnavailable(DAMAGED) from error
 
     def find(self, image: Image, names: Sequence[str] = ()) -> tuple[Thing, ...]:
         """What stands in an RGB image [H, W, 3] without drawings on it, whatever its names.
@@ -138,12 +143,13 @@ class Eye:
         likely = [each for each in seen.instances if each.probability >= MATCH.sure]
 
         def is_part(mask: CroppedMask) -> bool:
-            area = mask.area
-            wholes = (each.mask for each in likely if each.mask.area > MATCH.larger * area)
-            return any(mask.overlap(whole) > MATCH.part * area for whole in wholes)
+            wholes = (each.mask for each in likely if each.mask.area > MATCH.larger * mask.area)
+            return any(mask.overlap(whole) > MATCH.part * mask.area for whole in wholes)
 
-        regions = [each for each in find_regions(image) if _mean(seen.standing, each.mask) >= MATCH.seen]
-        kept = [each for each in regions if not is_part(each.mask)]
+        def stands(mask: CroppedMask) -> bool:
+            return bool(seen.standing[mask.rows, mask.columns][mask.patch].mean() >= MATCH.seen)
+
+        kept = [each for each in find_regions(image) if stands(each.mask) and not is_part(each.mask)]
         new = [
             replace(thing_of(image, each.mask), confidence=each.probability)
             for each in likely
@@ -160,9 +166,7 @@ class Eye:
         shares = np.exp(fine[:DRAWN] - fine[:DRAWN].max(axis=0))
         shares /= shares.sum(axis=0)
         heat, drawn, size = _sigmoid(coarse[0]), _sigmoid(fine[DRAWN]), fine.shape[:0:-1]
-        offsets = (
-            np.asarray(cv2.resize(np.ascontiguousarray(coarse[1:3].transpose(1, 2, 0)), size), np.float32) * OFFSET_UNIT
-        )
+        offsets = cv2.resize(OFFSET_UNIT * np.moveaxis(coarse[1:3], 0, 2), size).astype(np.float32)
         wide_heat = np.asarray(cv2.resize(heat, size), np.float32)
         smooth = cv2.GaussianBlur(heat, (0, 0), 0.6)
         is_peak = (smooth >= cv2.dilate(smooth, np.ones((5, 5), np.uint8))) & (heat > self.limits.centre)
@@ -260,7 +264,3 @@ def is_behind_any(thing: Thing, others: Sequence[Thing]) -> bool:
 
 def _sigmoid(logits: Floats32 | np.float64) -> Floats32:
     return np.asarray(1 / (1 + np.exp(-np.clip(logits, -30, 30))), np.float32)
-
-
-def _mean(values: Floats32, mask: CroppedMask) -> float:
-    return float(values[mask.rows, mask.columns][mask.patch].mean())
